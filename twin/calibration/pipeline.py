@@ -100,10 +100,12 @@ def calibrate(
     if state.errors:
         return state
     fitted = _first_fit(state, asked)
-    if fitted.state.errors:
-        return fitted.outcome
+    if fitted.state.errors or fitted.fit.certificate.spectrum.singular:
+        return fitted.outcome  # Nothing that such a geometry predicts has a meaning.
     if asked.second_look:
         fitted = _second_fit(fitted, solids)
+        if not fitted.state.measured:
+            return fitted.outcome
     implausible = judge_offsets(fitted.fit)
     if implausible is not None:  # Nothing else that such a fit shows has a meaning.
         return fitted.with_findings(implausible).outcome
@@ -141,15 +143,17 @@ def _first_fit(state: Calibration, asked: CalibrationRequest) -> Fitted:
         fit = fit_scans(state, request)
     if request.per_frame:
         state, fit = fit_with_motion(state, request, fit)
-    if request.known_sizes:
+    if request.known_sizes and not fit.certificate.spectrum.singular:
         state = state.with_findings(*judge_first_sizes(state, request, fit))
     return Fitted(state, request, fit, fit.iterations)
 
 
 def _second_fit(fitted: Fitted, solids: Scene | None) -> Fitted:
-    """Measure a second time, fit to that, and judge sizes, body and lag."""
+    """Measure a second time, fit to that, and judge sizes, body and lag, unless it failed."""
     request = fitted.request
     state, fit, iterations = measure_again(fitted.state, request, fitted.fit, solids)
+    if not state.measured:
+        return Fitted(state, request, fit, fitted.iterations + iterations)
     if request.known_sizes:
         state = state.with_findings(*judge_sizes(state, fit))
     state = state.with_findings(*listed(judge_body(state.measured)))

@@ -11,6 +11,7 @@ from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.camera_lag import lag_of, without_lag
 from flexdt.twin.calibration.detect.refine import FEW_WINDOWS, contrast_of, measure_beads
 from flexdt.twin.calibration.detect.windows import Windows, mended, plan_windows
+from flexdt.twin.calibration.diagnose import Finding, error
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.fits_of_scans import fit_scans
 from flexdt.twin.calibration.frame_source import (
@@ -25,6 +26,8 @@ CLOSE_PX = 0.02
 FAR_PX = 0.5
 """The same for a draft."""
 MOST_ROUNDS = 4
+LEAST_CONFIRMED = 0.25
+"""Least share of the first measurement's spots that the second must find."""
 
 
 def measure_again(
@@ -32,7 +35,9 @@ def measure_again(
 ) -> tuple[Calibration, FitResult, int]:
     """Measure in windows and fit again; once more if the first fit was far off.
 
-    With few frames the first fit is rough, so that a draft comes before the measurement.
+    With few frames the first fit is rough, so that a draft comes before the measurement. A
+    measurement that loses the spots of a scan is not fitted: state and fit stay as they were before
+    it, with a finding.
 
     Args:
         state: the scans, and which spot is which bead.
@@ -43,11 +48,14 @@ def measure_again(
     Returns:
         The state with what was measured, the fit to it, and the iterations of all fits.
     """
-    iterations = 0
+    first, iterations = (state, fit), 0
     windows = sum(len(s.frames) for s in state.scans) * len(state.model)
     draft = windows <= FEW_WINDOWS
     for _ in range(MOST_ROUNDS):
-        state, plans = _measured(state, fit, solids, draft)
+        measured, plans = _measured(state, fit, solids, draft)
+        if lost := _judge_confirmation(measured):
+            return first[0].with_findings(*lost), first[1], iterations
+        state = measured
         fit = fit_scans(state, request, fit.group_parameters)
         iterations += fit.iterations
         moved = _moved_px(state, fit, plans)
@@ -77,6 +85,26 @@ def _measured(
         lags.append(lag)
         plans.append(plan)
     return replace(state, measured=tuple(measured), lags=tuple(lags)), plans
+
+
+def _judge_confirmation(state: Calibration) -> list[Finding]:
+    """Judge whether the second measurement of every scan finds the spots of the first."""
+    out = []
+    scans = zip(state.scans, state.identifications, state.measured, strict=True)
+    for scan, first, second in scans:
+        before = first.index >= 0
+        confirmed = int((before & np.isfinite(second.tracks[..., 0])).sum())
+        if confirmed >= LEAST_CONFIRMED * before.sum() and confirmed:
+            continue
+        out.append(
+            error(
+                "spots_unconfirmed",
+                f"{scan.name}: {confirmed} of {int(before.sum())} spots are, where the first fit "
+                "expects them, shadows of balls of the phantom's size; are the images saturated or "
+                "clipped, and are phantom, geometry and pixel size right?",
+            )
+        )
+    return out
 
 
 def _moved_px(state: Calibration, fit: FitResult, plans: Sequence[Windows]) -> float:

@@ -33,6 +33,7 @@ from flexdt.twin.calibration.fit.priors import exact
 from flexdt.twin.calibration.fit.problem import from_printed_reading, to_printed_reading
 from flexdt.twin.calibration.frame_source import ArrayFrames
 from flexdt.twin.calibration.pipeline import Calibration, CalibrationRequest, Scan, calibrate
+from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray, from_unity
 from flexdt.twin.geometry.offsets import Offsets
@@ -50,7 +51,7 @@ from flexdt_extensions.studies.algorithm_2 import (
 )
 from flexdt_extensions.studies.experiments import PIXEL_MM, SHAPE, author, thesis, unity_poses
 from flexdt_extensions.studies.rendered_runs import line_integrals, photons
-from flexdt_extensions.studies.runs import Run, clean, fitted_run
+from flexdt_extensions.studies.runs import Run, attempted, clean, fitted_run
 
 STEPS: Final = np.array([STEP, STEP, STEP, SMALL_STEP, SMALL_STEP, SMALL_STEP])
 PHYSICAL: Final = np.array([1.0, 1.0, 1.0, 1.0, 1.0, -1.0])
@@ -410,7 +411,9 @@ def first_scan(
         reading=Reading.MOUNT_SHIFT, bead_tolerance_mm=TOLERANCE_MM, priors=exact()
     )
     result = calibrate([Scan(ArrayFrames(images, SHAPE), poses, name)], model, request, scene=scene)
-    assert result.fit is not None
+    if result.fit is None:
+        reasons = "; ".join(f.text for f in result.errors)
+        raise TwinError(f"{name}, whose volume gives the beads, has no geometry: {reasons}")
     # The last image repeats the first angle.
     turn = poses[np.arange(frames - 1)].cone_vec(result.fit.parameters)
     return found_beads(images[:-1], turn, model), result
@@ -442,8 +445,8 @@ def image_runs(
     poses, truth = nominal_poses(name, frames), hidden(name)
     printed = from_printed_reading(truth, Reading.MOUNT_SHIFT)
     images = radiographs(really, poses.cone_vec(truth), beam, [seed, int(name[4:])])
-    runs = []
-    for n in counts:
+
+    def solve(n: int) -> Run:
         chosen = np.floor(np.linspace(0, frames - 1, n)).astype(np.intp)
         some = ArrayFrames([images[i] for i in chosen], SHAPE)
         result = calibrate(
@@ -455,8 +458,9 @@ def image_runs(
             scene=scene,
         )
         note = "; ".join(f.text for f in result.errors)
-        runs.append(fitted_run(name, f"N = {n}", n, result.fit, printed, 0.2, note))
-    return runs
+        return fitted_run(name, f"N = {n}", n, result.fit, printed, 0.2, note)
+
+    return [attempted(name, f"N = {n}", n, solve) for n in counts]
 
 
 def off_truth(found: BeadModel, truth: BeadModel) -> FloatArray:

@@ -34,7 +34,7 @@ from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.projection import Scene, project_scene
 from flexdt_extensions.studies.experiments import SHAPE, WorkUnit
-from flexdt_extensions.studies.runs import Run, geometry_of, run_of
+from flexdt_extensions.studies.runs import Run, attempted, geometry_of, run_of
 
 COUNTS = 5000.0
 """Open-beam photons of a pixel in noisy images (calibration.md)."""
@@ -229,6 +229,31 @@ def image_runs(task: WorkUnit, model: BeadModel, scene: Scene) -> list[Run]:
     The images of the largest N are made once; smaller N take every so many of them, as far as
     they divide it (the thesis's do), with the same noise.
     """
+    most = max(task.counts)
+
+    def solve(n: int) -> Run:
+        if most % n:
+            raise ValueError(f"{n} projections are no even part of {most}")
+        everything, truth = geometry_of(task, most)
+        chosen = list(range(0, most, most // n))
+        scans = [
+            Scan(frames.take(chosen), poses[np.array(chosen)], f"placement {g + 1}")
+            for g, (frames, poses) in enumerate(
+                zip(_rendered(task, model, scene), everything, strict=True)
+            )
+        ]
+        result = calibrate(
+            scans, model, CalibrationRequest(free=task.free, priors=exact(task.free)), scene=scene
+        )
+        note = "; ".join(f.text for f in result.errors)
+        problem = None if result.fit is None or note else result.fit.problem
+        return run_of(task, n, result.fit, truth, problem, note)
+
+    return [attempted(task.setting, task.scenario, n, solve) for n in task.counts]
+
+
+def _rendered(task: WorkUnit, model: BeadModel, scene: Scene) -> tuple[RenderedFrames, ...]:
+    """Make the radiographs of a task's largest number of projections, or take those of the last."""
     camera = CLEAN if task.fidelity == "clean" else Rendering()
     most = max(task.counts)
     everything, truth = geometry_of(task, most)
@@ -241,19 +266,4 @@ def image_runs(task: WorkUnit, model: BeadModel, scene: Scene) -> list[Run]:
             render(scene, model, poses, truth, camera, [*seed, g])
             for g, poses in enumerate(everything)
         )
-    out = []
-    for n in task.counts:
-        if most % n:
-            raise ValueError(f"{n} projections are no even part of {most}")
-        chosen = list(range(0, most, most // n))
-        scans = [
-            Scan(frames.take(chosen), poses[np.array(chosen)], f"placement {g + 1}")
-            for g, (frames, poses) in enumerate(zip(_made[key], everything, strict=True))
-        ]
-        result = calibrate(
-            scans, model, CalibrationRequest(free=task.free, priors=exact(task.free)), scene=scene
-        )
-        note = "; ".join(f.text for f in result.errors)
-        problem = None if result.fit is None or note else result.fit.problem
-        out.append(run_of(task, n, result.fit, truth, problem, note))
-    return out
+    return _made[key]

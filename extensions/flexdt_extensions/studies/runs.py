@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
@@ -52,6 +52,7 @@ class Run:
             or empty.
         note: why there is no result.
         method: whose result this is; the other one is beside it.
+        failed: it raised an error instead of stating why there is no result.
     """
 
     setting: str
@@ -67,6 +68,7 @@ class Run:
     beside: dict[str, float] = field(default_factory=dict)
     note: str = ""
     method: str = OURS
+    failed: bool = False
 
     @property
     def mae(self) -> float:
@@ -95,10 +97,25 @@ def clean(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
+def attempted(setting: str, scenario: str, n: int, solve: Callable[[int], Run]) -> Run:
+    """Solve a run; one that raises an error has no result, and its note says why.
+
+    Args:
+        setting, scenario: which.
+        n: number of projections.
+        solve: makes the run from n.
+    """
+    try:
+        return solve(n)
+    except Exception as problem:
+        note = f"{type(problem).__name__}: {problem}"
+        return Run(setting, scenario, n, False, {}, {}, 0, math.nan, False, note=note, failed=True)
+
+
 def point_runs(task: WorkUnit, model: BeadModel) -> list[Run]:
     """All numbers of projections of a task in exact or noisy points (identities known)."""
-    out = []
-    for n in task.counts:
+
+    def solve(n: int) -> Run:
         parts, truth = geometry_of(task, n)
         poses = Poses.concatenate(parts)
         tracks = poses.cone_vec(truth).project_points(model.beads, SHAPE)
@@ -107,8 +124,9 @@ def point_runs(task: WorkUnit, model: BeadModel) -> list[Run]:
             key = [task.seed, *task.phantom.encode(), *task.scenario.encode(), n, len(parts)]
             tracks = tracks + NOISE_PX * np.random.default_rng(key).normal(size=tracks.shape)
         fit = estimate_geometry(tracks, model, poses, task.free, shape=SHAPE, noise_px=NOISE_PX)
-        out.append(run_of(task, n, fit, truth, fit.problem))
-    return out
+        return run_of(task, n, fit, truth, fit.problem)
+
+    return [attempted(task.setting, task.scenario, n, solve) for n in task.counts]
 
 
 def geometry_of(task: WorkUnit, n: int) -> tuple[list[Poses], Offsets]:
@@ -216,6 +234,7 @@ def rows_of(experiment: str, runs: Sequence[Run]) -> list[dict[str, object]]:
                 "runs": len(some),
                 "success": sum(r.success for r in some),
                 "unidentifiable": sum(not r.identifiable for r in some),
+                "failed": sum(r.failed for r in some),
                 "weak": sum(bool(r.weak) for r in some),
                 "mae": _mean(maes),
                 "mae_max": clean(float(maes.max())) if len(maes) else None,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final, Literal
 
-from flexdt.extending import Answer, Jobs, Scheduler, argument, note, option, table
+from flexdt.extending import Answer, CommandError, Jobs, Scheduler, argument, note, option, table
 
 Experiment = Literal["beads", "phantoms", "damping", "detector", "real", "basin"]
 Fidelity = Literal["points", "noisy", "clean", "images"]
@@ -61,6 +61,12 @@ def study(
     yield from real_lines(document)
     if out is not None:
         yield f"report: {out}"
+    if failed := [run for run in document["runs"] if run["failed"]]:
+        first = failed[0]
+        raise CommandError(
+            f"{len(failed)} of {len(document['runs'])} runs failed; the first, {first['setting']} "
+            f"{first['scenario']} with {first['projections']} projections: {first['note']}"
+        )
 
 
 def _text(value: object) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from flexdt.clients.cli.command_tree import run as command
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.bead_model import bead_model
 from flexdt.twin.errors import UnknownNameError
+from flexdt_extensions.studies import runs as solved_runs
 from flexdt_extensions.studies.experiment_4 import hidden_phantom, off_truth
 from flexdt_extensions.studies.experiments import (
     EXPERIMENTS,
@@ -88,6 +90,48 @@ def test_rendered_noisy_images_with_unknown_identities() -> None:
         assert run.identifiable
         assert run.mae < 0.01
         assert max(run.errors[n] / run.sigmas[n] for n in run.errors) < 6.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_an_experiment_in_images_runs_to_its_end(experiment: str) -> None:
+    """Whole by `flexdt study EXPERIMENT --fidelity images`; here with two numbers of projections.
+
+    One bead determines nothing; of two beads, three images may be too few.
+    """
+    document = run_study(experiment, "images", counts=(3, 12), jobs=1)
+    assert [run["note"] for run in document["runs"] if run["failed"]] == []
+    assert all(run["note"] for run in document["runs"] if not run["identifiable"])
+    for row in document["rows"]:
+        few = 2 if experiment != "beads" else int(row["setting"])
+        if few == 1:
+            assert row["unidentifiable"] == row["runs"]
+        else:
+            assert row["success"] >= (row["runs"] if few > 2 else row["runs"] - 2), row["setting"]
+
+
+def test_a_run_that_raises_is_a_row_with_its_reason(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    estimate = solved_runs.estimate_geometry
+
+    def raising(tracks: Any, *args: Any, **options: Any) -> Any:
+        if len(tracks) == 5:
+            raise ArithmeticError("planted")
+        return estimate(tracks, *args, **options)
+
+    monkeypatch.setattr(solved_runs, "estimate_geometry", raising)
+    document = run_study("phantoms", "points", counts=(3, 5), jobs=1)
+    assert len(document["runs"]) == 70
+    for row in document["rows"]:
+        assert (row["runs"], row["failed"], row["success"]) == (10, 5, 5)
+    reasons = {run["note"] for run in document["runs"] if run["projections"] == 5}
+    assert reasons == {"ArithmeticError: planted"}
+    assert command(["study", "phantoms", "--jobs", "1"]) == 1
+    shown = capsys.readouterr()
+    assert "normal" in shown.out
+    assert "35 of 490 runs failed" in shown.err
+    assert "planted" in shown.err
 
 
 def test_cut_beads_solve_the_tall_phantom() -> None:

@@ -72,6 +72,11 @@ class Conditioning:
         """Every column is determined."""
         return self.rank == len(self.names) and not self.null
 
+    @property
+    def singular(self) -> bool:
+        """The data leave some direction open altogether."""
+        return any(math.isinf(direction.sigma) for direction in self.null)
+
 
 def spectrum(
     jacobian: FloatArray,
