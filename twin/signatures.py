@@ -79,6 +79,31 @@ def with_arguments_of(
     return typed
 
 
+def with_options_of(declared: type) -> Callable[[Thing], Thing]:
+    """A decorator: the `**options` of a function are the keys of a TypedDict, each None by default.
+
+    They stand in its signature, and their descriptions in its docstring, in place of the line
+    `options: OPTIONS` of its arguments.
+
+    Args:
+        declared: the TypedDict, whose docstring has a last section `Args:`.
+    """
+    told = inspect.cleandoc(declared.__doc__ or "").partition("Args:\n")[2]
+    hints = typing.get_type_hints(declared)
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    more = [inspect.Parameter(n, keyword, default=None, annotation=h) for n, h in hints.items()]
+
+    def declaring(function: Thing) -> Thing:
+        said = inspect.signature(function)
+        named = [p for p in said.parameters.values() if p.kind is not p.VAR_KEYWORD]
+        function.__signature__ = said.replace(parameters=[*named, *more])  # type: ignore[attr-defined]
+        text = inspect.cleandoc(function.__doc__ or "")
+        function.__doc__ = text.replace("    options: OPTIONS", told.rstrip())
+        return function
+
+    return declaring
+
+
 def public(thing: Thing) -> Thing:
     """A decorator: calls of a function, or of a class and its methods, are checked.
 

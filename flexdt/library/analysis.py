@@ -6,13 +6,14 @@ line calls too.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Unpack
 
 from flexdt.library.calibration.align_dataset import Aligned
-from flexdt.library.calibration.calibrate import Outcome, calibrate_datasets, calibration_request
+from flexdt.library.calibration.calibrate import Outcome, calibrate_with
+from flexdt.library.calibration.calibration_options import CalibrationOptions
 from flexdt.library.data_set import DataSet
 from flexdt.library.datasets.exchange import with_geometry
 from flexdt.library.reading.folders import load_dataset, read_tiffs
@@ -24,24 +25,19 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.physics.tube import Tube
 from flexdt.twin.projection import Volume
-from flexdt.twin.signatures import public
+from flexdt.twin.signatures import public, with_options_of
 
 Data = DataSet | str | PathLike[str]
 
 
 @public
+@with_options_of(CalibrationOptions)
 def calibrate(
     data: Data | Sequence[Data] | None,
     phantom: str | Phantom,
     *,
-    free: Sequence[str] | None = None,
-    priors: Mapping[str, float] | None = None,
-    start: Mapping[str, float] | None = None,
     geometry: ConeVec | str | PathLike[str] | None = None,
-    markers: str | PathLike[str] | Sequence[Any] | None = None,
-    scale: str | None = None,
-    radius: float | None = None,
-    per_frame: Sequence[str] = (),
+    **options: Unpack[CalibrationOptions],
 ) -> Outcome[DataSet]:
     """Estimate the geometry of scans of a bead phantom, or of markers of unknown positions.
 
@@ -50,20 +46,9 @@ def calibrate(
             `geometry` are all there is.
         phantom: a phantom, its name, the path of a phantom file, or "unknown": three or more
             markers of which nobody knows where they are.
-        free: the parameters to estimate; default: the thesis's six, for unknown markers dO_x.
-        priors: how well other offsets are known, parameter -> standard deviation [mm, deg, 1], in
-            place of the machine's and the profile's; 0 is exactly.
-        start: offsets to begin with [mm, deg, 1], about which priors are centred.
         geometry: nominal geometry of all frames, or its file: in place of the data set's, or for a
             folder of anybody's TIFF images (see `read_tiffs`).
-        markers: CSV or NumPy file with the pixels at which markers were seen, or such marks
-            themselves: (frame, marker, column, row, sigma), sigma None where it is not known;
-            default: they are detected in the images.
-        scale: distance of two unknown markers, "A-B=MM" or "A-B=MM+-SIGMA".
-        radius: of the spots of beads [px]; default: what the phantom says, or any.
-        per_frame: parameters that may also move during the scan (dO_x, dO_y, dO_z, alpha, dS_x,
-            dS_y, dD_x, dD_y, dD_z). What moves is in the geometry of the result's `datasets`, not
-            in its `correction`: `found.datasets[0].with_correction(found.correction)` has both.
+        options: OPTIONS
 
     Returns:
         The calibration with its uncertainty report; `document` is the JSON of `flexdt calibrate`.
@@ -81,6 +66,7 @@ def calibrate(
     """
     if isinstance(geometry, str | PathLike):
         geometry = ConeVec.load(geometry)
+    markers = options.get("markers")
     if data is None:
         if geometry is None or markers is None:
             raise TwinError("no data: allowed with geometry and markers")
@@ -89,10 +75,7 @@ def calibrate(
     else:
         several = [data] if isinstance(data, DataSet | str | PathLike) else list(data)
         sets = [_opened(d) if geometry is None else _posed(d, geometry) for d in several]
-    request = calibration_request(phantom, free, priors, start, per_frame)
-    return calibrate_datasets(
-        sets, phantom, request, markers=markers, scale=scale, radius_px=radius
-    )
+    return calibrate_with(sets, phantom, options)
 
 
 @public

@@ -6,15 +6,16 @@ method is first called: detection, kernels and figures are heavy.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, Unpack
 
+from flexdt.library.calibration.calibration_options import CalibrationOptions
 from flexdt.library.datasets.exchange import with_geometry
 from flexdt.library.datasets.image_set import ImageSet
 from flexdt.twin.algorithms import DEFAULT, PLAIN
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets
-from flexdt.twin.signatures import File, public
+from flexdt.twin.signatures import File, public, with_options_of
 
 if TYPE_CHECKING:
     from flexdt.library.calibration.align_dataset import Aligned
@@ -61,30 +62,27 @@ class DataSet(ImageSet):
         (0.6931, 2)
     """
 
+    @with_options_of(CalibrationOptions)
     def calibrate(
         self,
         phantom: str | Phantom,
         *,
-        free: Sequence[str] | None = None,
-        priors: Mapping[str, float] | None = None,
-        start: Mapping[str, float] | None = None,
         geometry: ConeVec | File | None = None,
-        markers: Any = None,
-        scale: str | None = None,
-        radius: float | None = None,
-        per_frame: Sequence[str] = (),
+        **options: Unpack[CalibrationOptions],
     ) -> Outcome[DataSet]:
         """Estimate the geometry from the beads of a phantom; see `flexdt.calibrate`.
 
         `data.with_correction(data.calibrate("lego").correction)` is the corrected data set.
+
+        Args:
+            phantom: a phantom, its name, the path of a phantom file, or "unknown".
+            geometry: nominal geometry of all frames, or its file, in place of the data set's.
+            options: OPTIONS
         """
-        from flexdt.library.calibration.calibrate import calibrate_datasets, calibration_request
+        from flexdt.library.calibration.calibrate import calibrate_with
 
         posed = self if geometry is None else with_geometry(self, geometry)
-        request = calibration_request(phantom, free, priors, start, per_frame)
-        return calibrate_datasets(
-            [posed], phantom, request, markers=markers, scale=scale, radius_px=radius
-        )
+        return calibrate_with([posed], phantom, options)
 
     def align(self, *, per_frame: bool = False) -> Aligned[DataSet]:
         """Estimate the geometry without a phantom; see `flexdt.align`.

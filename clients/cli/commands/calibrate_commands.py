@@ -25,9 +25,9 @@ from flexdt.runtime.files.whole_files import write_whole
 
 if TYPE_CHECKING:
     from flexdt.clients.client.client import TwinClient
+    from flexdt.library.calibration.calibration_options import CalibrationOptions
     from flexdt.library.data_set import DataSet
     from flexdt.library.datasets.exchange import Given
-    from flexdt.twin.calibration.pipeline import CalibrationRequest
     from flexdt.twin.scanner.state import NamedCorrection
 
 ReadingName = Literal["axis", "mount"]
@@ -81,12 +81,23 @@ def calibrate(
     """
     if report is not None:
         option_values.require_ending(report, ".html", ".json")
-    from flexdt.library.calibration.calibrate import calibrate_datasets
+    from flexdt.library.calibration.calibrate import calibrate_with
     from flexdt.library.calibration.calibration_report import write_report
-    from flexdt.library.calibration.markers import Scale
     from flexdt.library.figures import require_plots
 
-    request = _request(phantom, free, per_scan, per_frame, reading, bead_tolerance, prior, start)
+    options: CalibrationOptions = {
+        "free": None if free is None else option_values.names(free),
+        "per_scan": option_values.names(per_scan),
+        "per_frame": option_values.names(per_frame),
+        "reading": reading,
+        "bead_tolerance": bead_tolerance,
+        "priors": "none" if prior == ["none"] else _assigned(prior),
+        "start": _assigned(start),
+        "bound": chosen(CalibrateSettings).bound,
+        "markers": markers,
+        "scale": scale,
+        "radius": radius,
+    }
     target = _named(phantom)
     if per_scan and len(datasets or ()) > 1 and push:
         raise typer.BadParameter("--push: with --per-scan there is no one geometry to push")
@@ -94,11 +105,8 @@ def calibrate(
         _require_answer(twin)
     if report is not None and report.suffix.lower() != ".json":
         require_plots()
-    outcome = calibrate_datasets(
-        _given(datasets or [], frames, markers, geometry or [], said(None, shape, pixel)), target,
-        request, markers=markers, scale=None if scale is None else Scale.of(scale),
-        radius_px=radius,
-    )  # fmt: skip
+    given = _given(datasets or [], frames, markers, geometry or [], said(None, shape, pixel))
+    outcome = calibrate_with(given, target, options)
     document: dict[str, Any] = outcome.document
     if report is not None:
         write_report(outcome, report)
@@ -115,31 +123,6 @@ def calibrate(
         raise CommandError(f"not to be used{codes and ': '}{codes}", NOT_IDENTIFIABLE)
     if push:
         _push(twin, outcome.correction, outcome.sources, document)
-
-
-def _request(
-    phantom: str | None, free: str | None, per_scan: str, per_frame: str, reading: ReadingName,
-    bead_tolerance: float | None, prior: list[str] | None, start: list[str] | None,
-) -> CalibrationRequest:  # fmt: skip
-    """What is to be estimated, and what is known of it."""
-    from flexdt.twin.calibration.fit.priors import exact
-    from flexdt.twin.calibration.fit.problem import SIX, Reading
-    from flexdt.twin.calibration.pipeline import CalibrationRequest
-    from flexdt.twin.calibration.unknown_markers import UNKNOWN
-    from flexdt.twin.geometry.offsets import Offsets
-
-    usual = ("dO_x",) if phantom == UNKNOWN else SIX
-    asked = usual if free is None else option_values.names(free)
-    return CalibrationRequest(
-        free=asked,
-        per_scan=option_values.names(per_scan),
-        reading={"axis": Reading.AXIS_AT_O_PLUS_TAU, "mount": Reading.MOUNT_SHIFT}[reading],
-        bead_tolerance_mm=bead_tolerance,
-        priors=exact(asked) if prior == ["none"] else _assigned(prior),
-        bound=chosen(CalibrateSettings).bound,
-        start=Offsets.from_edge(_assigned(start)),
-        per_frame=option_values.names(per_frame),
-    )
 
 
 def _assigned(given: list[str] | None) -> dict[str, float]:

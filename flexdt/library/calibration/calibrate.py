@@ -21,6 +21,8 @@ from typing import Final, Generic
 
 import numpy as np
 
+from flexdt.library.calibration.calibration_options import CalibrationOptions
+from flexdt.library.calibration.calibration_request import detection_of, request_of
 from flexdt.library.calibration.dataset_frames import DatasetFrames
 from flexdt.library.calibration.markers import (
     Mark,
@@ -116,21 +118,12 @@ class Outcome(Generic[Images_co]):
         )
 
 
-def calibration_request(
-    phantom: str | Phantom,
-    free: Sequence[str] | None,
-    priors: Mapping[str, float] | None,
-    start: Mapping[str, float] | None,
-    per_frame: Sequence[str],
-) -> CalibrationRequest:
-    """Fill in the defaults of what a user asks of a calibration; see `flexdt.calibrate`."""
-    default = ("dO_x",) if phantom == UNKNOWN else SIX
-    return CalibrationRequest(
-        free=default if free is None else tuple(free),
-        priors=priors or {},
-        start=Offsets.from_edge(start or {}),
-        per_frame=tuple(per_frame),
-    )
+def calibrate_with(
+    datasets: Sequence[Images], phantom: str | Phantom, options: CalibrationOptions
+) -> Outcome[Images]:
+    """Calibrate from data sets with a user's options; see `calibrate_datasets`."""
+    request = request_of(phantom, options)
+    return calibrate_datasets(datasets, phantom, request, **detection_of(options))
 
 
 def calibrate_datasets(

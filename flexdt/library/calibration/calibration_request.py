@@ -1,0 +1,61 @@
+"""The options of a calibration, as a request and as where to look for beads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+from flexdt.library.calibration.calibration_options import CalibrationOptions
+from flexdt.twin.calibration.fit.priors import exact
+from flexdt.twin.calibration.fit.problem import SIX, Reading
+from flexdt.twin.calibration.request import CalibrationRequest
+from flexdt.twin.calibration.unknown_markers import UNKNOWN
+from flexdt.twin.geometry.offsets import Offsets
+
+READINGS: Final[Mapping[str, Reading]] = {
+    "axis": Reading.AXIS_AT_O_PLUS_TAU,
+    "mount": Reading.MOUNT_SHIFT,
+}
+_IN_REQUEST: Final[Mapping[str, tuple[str, Callable[[Any], object]]]] = {
+    "per_scan": ("per_scan", tuple),
+    "per_frame": ("per_frame", tuple),
+    "reading": ("reading", READINGS.__getitem__),
+    "bead_tolerance": ("bead_tolerance_mm", float),
+    "start": ("start", Offsets.from_edge),
+    "bound": ("bound", float),
+}
+"""Option -> attribute of the request, and how it is made of the option's value."""
+OF_DETECTION: Final[Mapping[str, str]] = {
+    "markers": "markers",
+    "scale": "scale",
+    "radius": "radius_px",
+}
+"""Option -> argument of `calibrate_datasets`: what says where the beads are."""
+
+
+def request_of(phantom: object, options: CalibrationOptions) -> CalibrationRequest:
+    """Give what a calibration is to estimate, the defaults filled in.
+
+    Args:
+        phantom: as of `flexdt.calibrate`.
+        options: of the user.
+
+    Raises:
+        UnknownNameError, TwinError: as `CalibrationRequest`.
+    """
+    given = {name: value for name, value in options.items() if value is not None}
+    free: Any = given.get("free", ("dO_x",) if phantom == UNKNOWN else SIX)
+    priors: Any = given.get("priors", {})
+    made: dict[str, Any] = {
+        attribute: make(given[name])
+        for name, (attribute, make) in _IN_REQUEST.items()
+        if name in given
+    }
+    return CalibrationRequest(
+        free=tuple(free), priors=exact(tuple(free)) if priors == "none" else priors, **made
+    )
+
+
+def detection_of(options: CalibrationOptions) -> dict[str, Any]:
+    """Give the arguments of `calibrate_datasets` that say where the beads are."""
+    return {argument: options.get(name) for name, argument in OF_DETECTION.items()}
