@@ -13,6 +13,7 @@ given memory compile at their first use.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +21,7 @@ import numpy.typing as npt
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.geometry.virtual_panel import run_through
 from flexdt.twin.projection import cpu
 from flexdt.twin.projection.analytic_solids import (
     Box,
@@ -28,6 +30,7 @@ from flexdt.twin.projection.analytic_solids import (
     Solid,
     Sphere,
     as_convex,
+    hull_points,
     shadows,
 )
 from flexdt.twin.projection.cpu import threads
@@ -143,7 +146,7 @@ def _project(
     # What `analytic_kernels` takes: has a quadric, M, c; slabs, and which of them are a solid's.
     quadric = np.array([[one.curved, *one.matrix.ravel(), *one.center] for one in shapes], float)
     ends = np.cumsum([0, *(len(one.slabs) for one in shapes)])
-    rays = geometry.rays(shape)
+    rays = run_through(geometry, np.concatenate([hull_points(one) for one in shapes])).rays(shape)
     slabs = np.concatenate([one.slabs for one in shapes])
     slab_range = np.column_stack([ends[:-1], ends[1:]])
     seen = shadows(shapes, rays, shape)
@@ -276,6 +279,8 @@ def project_mesh(
         return result
     from flexdt.twin.projection.kernels import analytic_kernels
 
+    ends = np.stack([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)], axis=1)
+    geometry = run_through(geometry, np.array(list(product(*ends))))
     rays = geometry.rays(shape)
     rays[:, 3:6] += ASIDE[0] * geometry.u + ASIDE[1] * geometry.v
     basis = np.stack([geometry.u, geometry.v, rays[:, 3:6]], axis=2)

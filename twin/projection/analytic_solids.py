@@ -157,6 +157,14 @@ def as_convex(shape: Shape) -> Convex:
             assert_never(shape)
 
 
+def hull_points(one: Convex) -> FloatArray:
+    """Points whose convex hull holds a solid, (k, 3) [mm]."""
+    if one.corners is not None:
+        return one.corners
+    assert one.semi_axes is not None
+    return _corners(one.center, np.eye(3), np.linalg.norm(one.semi_axes, axis=0))
+
+
 def shadows(shapes: Sequence[Convex], rays: FloatArray, shape: tuple[int, int]) -> IntArray:
     """Pixels each solid can darken: (n, k, 4) = first row, last row + 1, first column, last + 1.
 

@@ -3,7 +3,8 @@ voxel projectors.
 
 Arguments are checked and brought into voxel units here. A CUDA device computes where there is one
 with room for the volume, the processor otherwise; both give exact Siddon lengths. Rays run from the
-focal spot to the pixel centre, no further.
+focal spot through the pixel's centre and on: a panel before or inside the volume cuts none of them
+(`virtual_panel`).
 
 Each view is walked along the axis on which its levels are stacked, or ray by ray. A ray acts
 wherever it passes from one level to the next, so levels should be stacked along the axis that rays
@@ -32,6 +33,13 @@ from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec, check_spread
 from flexdt.twin.geometry.cone_vec import check_shape as check_shape
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray, as_numbers
+from flexdt.twin.geometry.virtual_panel import (
+    relaxed_gradient,
+    run_through,
+    stretched,
+    stretched_steps,
+    stretches,
+)
 from flexdt.twin.projection import cpu, fan_plan, gpu
 from flexdt.twin.projection.cpu import TILE
 from flexdt.twin.projection.fan_plan import FACING, SPREAD, WIDEST
@@ -170,6 +178,7 @@ def forward(
     if isinstance(volume, DeviceVolume):
         if out is not None:
             raise GeometryError("out is of the host; allowed: None for a volume on a device", {})
+        geometry = run_through(geometry, corners_of(volume))
         there, rays = volume.layout, voxel_rays(geometry, volume.layout, shape)
         # Arrays on a device have no type of their own.
         images: Float32Array = gpu.demand(
@@ -178,6 +187,7 @@ def forward(
         return images
     result = check_out(out, (len(geometry), *shape))
     volume = as_volume(volume)
+    geometry = run_through(geometry, corners_of(volume))
     if _on_device(volume, geometry, shape, result):
         return result
     for some, order, fans in by_level_axis(volume, geometry, shape):
@@ -248,6 +258,7 @@ def back(
     values = check_projections(projections, len(geometry))
     shape = geometry.of_shape((values.shape[1], values.shape[2]))
     like = as_volume(like)
+    geometry = run_through(geometry, corners_of(like))
     if gpu.is_there(values):
         if out is not None:
             raise GeometryError("out is of the host; allowed: None for images on a device", {})
@@ -307,6 +318,13 @@ def _spread(
     for order, room in rooms.items():
         data = room.transpose([2 - order.index(axis) for axis in (2, 1, 0)])
         bring_over(data, layout.flat, layout.stride_x, layout.stride_y, adding=True)
+
+
+def corners_of(volume: Volume | DeviceVolume) -> FloatArray:
+    """The corners of a volume's box, (8, 3) [mm]."""
+    half = 0.5 * np.array(volume.shape[::-1]) * volume.voxel_xyz
+    signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
+    return np.asarray(volume.center_mm + signs * half)
 
 
 def box_of(layout: Layout) -> Box:
@@ -435,6 +453,8 @@ def geometry_gradient(
     values = check_projections(weights, len(geometry))
     n, rows, cols = values.shape
     geometry.of_shape((rows, cols))
+    times = stretches(geometry, corners_of(volume))
+    geometry = stretched(geometry, times)
     tiles = -(-cols // TILE)
     parts = np.zeros((n * tiles, 12))
     layout = volume.layout
@@ -444,7 +464,7 @@ def geometry_gradient(
         job_ns = JUMPS * cpu.tile_ns(box, rows)
         for first, last in equal_portions(len(parts), job_ns, cpu.threads()):
             siddon_kernels.gather(box, views, values, TILE, parts, first, last)
-    return np.asarray(parts.reshape(n, tiles, 12).sum(axis=1))
+    return relaxed_gradient(parts.reshape(n, tiles, 12).sum(axis=1), times)
 
 
 def geometry_change(
@@ -485,10 +505,13 @@ def geometry_change(
         raise GeometryError.of_shape("the geometry's change", moved.shape, wanted, " or (12,)")
     shape = geometry.of_shape(shape)
     result = np.zeros((len(geometry), *shape), np.float32)
+    times = stretches(geometry, corners_of(volume))
+    geometry = stretched(geometry, times)
     layout = volume.layout
     if not layout.empty and len(geometry):
         views = voxel_rays(geometry, layout, shape)
-        steps = np.ascontiguousarray(np.broadcast_to(moved, (len(geometry), 12)))
+        each = np.broadcast_to(moved, (len(geometry), 12))
+        steps = np.ascontiguousarray(stretched_steps(each, times))
         box, jobs = box_of(layout), len(geometry) * -(-shape[1] // TILE)
         job_ns = JUMPS * cpu.tile_ns(box, shape[0])
         for first, last in equal_portions(jobs, job_ns, cpu.threads()):

@@ -35,7 +35,7 @@ def _siddon(data, voxel, center, cone_vec, shape, pixels=None):
 
 def _ray(data, voxel, low, counts, start, end):
     d = end - start
-    t0, t1 = 0.0, 1.0
+    t0, t1 = 0.0, np.inf  # the panel is virtual
     for a in range(3):
         ends = np.array([low[a], low[a] + counts[a] * voxel[a]])
         if d[a] == 0:

@@ -58,13 +58,13 @@ def test_forward_of_one_voxel_is_its_chord(circle) -> None:
     assert image[0, 1, 1] == pytest.approx(2.0 * 3.0, rel=1e-6)
 
 
-def test_rays_end_at_source_and_pixel() -> None:
-    # Source in the middle of the volume, detector in the middle: half the box each.
+def test_rays_begin_at_the_source_and_run_through_the_pixel() -> None:
+    # Source in the middle of the volume: half the box; the panel there: all of it.
     volume = Volume(np.ones((5, 10, 5), np.float32), 1.0)
     inside = ConeVec.from_vectors((0.1, 0, 0.1), (0.1, 30, 0.1), (0.1, 0, 0), (0, 0, -0.1))
     assert forward(volume, inside, (1, 1))[0, 0, 0] == pytest.approx(5.0, rel=1e-6)
     short = ConeVec.from_vectors((0.1, -30, 0.1), (0.1, 2, 0.1), (0.1, 0, 0), (0, 0, -0.1))
-    assert forward(volume, short, (1, 1))[0, 0, 0] == pytest.approx(7.0, rel=1e-6)
+    assert forward(volume, short, (1, 1))[0, 0, 0] == pytest.approx(10.0, rel=1e-6)
 
 
 def test_z_contiguous_data_give_the_same_image_without_a_copy(circle) -> None:

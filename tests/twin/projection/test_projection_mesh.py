@@ -90,7 +90,7 @@ def test_source_inside_and_detector_inside() -> None:
     inside = ConeVec.from_vectors((0.1, 0, 0.1), (0.1, 9, 0.1), (0.1, 0, 0), (0, 0, -0.1))
     assert project_mesh(box, inside, (3, 3))[0, 1, 1] == pytest.approx(1.0, abs=1e-6)
     short = ConeVec.from_vectors((0.1, -9, 0.1), (0.1, 0.5, 0.1), (0.1, 0, 0), (0, 0, -0.1))
-    assert project_mesh(box, short, (3, 3))[0, 1, 1] == pytest.approx(1.5, abs=1e-6)
+    assert project_mesh(box, short, (3, 3))[0, 1, 1] == pytest.approx(2.0, abs=1e-6)
     behind = ConeVec.from_vectors((0.1, 5, 0.1), (0.1, 9, 0.1), (0.1, 0, 0), (0, 0, -0.1))
     assert not project_mesh(box, behind, (3, 3)).any()
 

@@ -1,0 +1,82 @@
+"""Rays that run through: a panel before or inside an object is virtual, and cuts no ray.
+
+Line integrals are those of whole rays, from the focal spot to infinity, as other programs have
+them: their samples often put the panel at the rotation axis, with pixels as small as there.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import FloatArray
+
+MARGIN: Final = 1.001
+"""How far behind an object its virtual panel is moved, relative to its distance."""
+
+
+def stretches(cone_vec: ConeVec, points: FloatArray) -> FloatArray:
+    """Find how many times further from the source a panel must stand to be behind an object.
+
+    Args:
+        cone_vec: n views.
+        points: (k, 3) whose convex hull holds the object [mm].
+
+    Returns:
+        (n,), 1 where the panel is behind the object already.
+    """
+    if not len(points) or not len(cone_vec):
+        return np.ones(len(cone_vec))
+    normal = np.cross(cone_vec.u, cone_vec.v)
+    panel = np.einsum("ni,ni->n", cone_vec.detector - cone_vec.source, normal)
+    depth = normal @ points.T - np.einsum("ni,ni->n", cone_vec.source, normal)[:, None]
+    with np.errstate(all="ignore"):
+        furthest = (depth / panel[:, None]).max(axis=1)
+    return np.where(furthest > 1.0, MARGIN * furthest, 1.0)
+
+
+def run_through(cone_vec: ConeVec, points: FloatArray) -> ConeVec:
+    """Move the panels that cut an object behind it, with pixels so much larger: the same rays.
+
+    Args:
+        cone_vec: n views.
+        points: (k, 3) whose convex hull holds the object [mm].
+
+    Returns:
+        The geometry; the argument itself where no panel cuts.
+
+    Example:
+        >>> scan = ConeVec.circular(sod=100, sdd=100, angles=4, pixel=0.5)
+        >>> through = run_through(scan, np.array([[0.0, 0.0, 0.0], [0.0, 10.0, 0.0]]))
+        >>> through.source_detector_distance.round(2).tolist()
+        [110.11, 100.0, 100.0, 100.0]
+    """
+    return stretched(cone_vec, stretches(cone_vec, points))
+
+
+def stretched(cone_vec: ConeVec, times: FloatArray) -> ConeVec:
+    """Move panels `times` (n,) as far from the source, with pixels as many times as large."""
+    moved = times != 1.0
+    if not moved.any():
+        return cone_vec
+    rows = cone_vec.rows.copy()
+    rows[moved] = stretched_steps(rows[moved], times[moved])
+    return ConeVec(rows, cone_vec.detector_shape)
+
+
+def stretched_steps(rows: FloatArray, times: FloatArray) -> FloatArray:
+    """Rows (n, 12), or changes of them, of panels `times` (n,) as far from the source."""
+    out, many = rows.copy(), times[:, None]
+    out[:, 3:6] = rows[:, :3] + many * (rows[:, 3:6] - rows[:, :3])
+    out[:, 6:] = many * rows[:, 6:]
+    return out
+
+
+def relaxed_gradient(gradient: FloatArray, times: FloatArray) -> FloatArray:
+    """Derivatives (n, 12) by rows, from those by `stretched_steps` of the rows."""
+    out, many = gradient.copy(), times[:, None]
+    out[:, :3] = gradient[:, :3] + (1.0 - many) * gradient[:, 3:6]
+    out[:, 3:] = many * gradient[:, 3:]
+    return out
