@@ -33,6 +33,8 @@ from flexdt.twin.exchange.number_tables import (
 )
 from flexdt.twin.geometry.cone_vec import ConeVec, Shape2, check_spread
 from flexdt.twin.geometry.conventions import FloatArray, as_numbers
+from flexdt.twin.plausibility import warn_of
+from flexdt.twin.plausibility.scan_geometry import radian_findings
 from flexdt.twin.signatures import File
 
 OWN: Final = OWN_ENDINGS[0]
@@ -70,6 +72,7 @@ def from_astra(geometry: Any, shape: Shape2 | None) -> ConeVec:
 
 def _circle_of_astra(geometry: Mapping[str, Any]) -> FloatArray:
     """Rows of type `cone`: our circle, with v upwards."""
+    warn_of(radian_findings(geometry["ProjectionAngles"]), GeometryError, stacklevel=5)
     circle = ConeVec.circular(
         sod=float(geometry["DistanceOriginSource"]),
         sdd=float(geometry["DistanceOriginSource"]) + float(geometry["DistanceOriginDetector"]),

@@ -32,7 +32,6 @@ from flexdt.phantoms.samples import as_phantom
 from flexdt.twin.errors import GeometryError, LimitError, require_within
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
-from flexdt.twin.geometry.plausibility import geometry_doubts
 from flexdt.twin.machine.camera import CameraSettings, PixelGrid, Roi
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.physics.blur import spot_blur_px
@@ -56,6 +55,7 @@ from flexdt.twin.physics.scatter import (
     scan_scatter,
 )
 from flexdt.twin.physics.tube import Tube, tube_of
+from flexdt.twin.plausibility import Operation, examine, settled, warn_of
 from flexdt.twin.projection import Volume, forward, project_body
 from flexdt.twin.projection.analytic_solids import Vector
 from flexdt.twin.projection.operators import as_cone_vec
@@ -196,8 +196,8 @@ def project(
     size = cone.of_shape(shape)
     plain = isinstance(sample, Volume) and material is None
     body: Any = sample if plain else as_phantom(sample, material=material, voxel_mm=voxel_mm)
-    for doubt in geometry_doubts(cone, size, body.boxes):
-        warnings.warn(doubt, stacklevel=3)
+    found = examine(Operation.PROJECT, cone, size, volume=_attenuation(body), boxes=body.boxes)
+    warn_of(found, GeometryError)
     return (forward if plain else line_integrals)(body, cone, size)
 
 
@@ -298,6 +298,10 @@ def simulate(
     panel, camera = _panel(detector, scanner, size, *_pitch(cone))
     design = settings.model(None if scanner is None else tube_of(scanner.tube))
     phantom = as_phantom(sample, material=material, voxel_mm=voxel_mm)
+    found = examine(
+        Operation.SIMULATE, cone, size, volume=_attenuation(phantom), boxes=phantom.boxes
+    )
+    placed = settled(found, GeometryError)
     parts = channels(phantom)
     chain = chain_through(parts, panel, design, settings.mono_keV)
     nothing = np.zeros(size, np.float32)
@@ -336,11 +340,18 @@ def simulate(
             progress((i + 1) / len(cone))
     made = DataSet.from_arrays(counts, cone, dark=dark, flat=flat, name=phantom.name, truth=truth)
     made = replace(made, full_scale=panel.full_scale)
-    placed = geometry_doubts(cone, size, phantom.boxes)
     told = *placed, *image_doubts(made), *_flat_doubt(size, cone), *_spot_doubt(truth)
     for doubt in told:
         warnings.warn(doubt, stacklevel=3)
     return replace(made, warnings=(*truth.assumed, *told))
+
+
+def _attenuation(body: Volume | Phantom) -> npt.NDArray[Any] | None:
+    """The voxels' attenuation, where a sample has some."""
+    if isinstance(body, Volume):
+        return body.data
+    voxels = body.voxels
+    return None if voxels is None or voxels.labels is not None else voxels.data
 
 
 def _chosen_ms(panel: Detector, camera: CameraSettings, beam_e_per_ms: float) -> float:

@@ -8,7 +8,8 @@ import pkgutil
 
 import pytest
 
-ROOMS = ("collision", "dataset", "exchange", "geometry", "machine", "motion", "scanner", "script")
+ROOMS = ("collision", "dataset", "exchange", "geometry", "machine", "motion",
+         "plausibility", "scanner", "script")  # fmt: skip
 
 
 @pytest.mark.parametrize("room", ROOMS)

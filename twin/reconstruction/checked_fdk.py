@@ -9,9 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.algorithms import PLAIN
+from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
-from flexdt.twin.projection import Grid, Volume
+from flexdt.twin.plausibility import Operation, examine, warn_of
+from flexdt.twin.projection import Grid, Volume, as_volume
 from flexdt.twin.projection.operators import (
     as_cone_vec,
     check_projections,
@@ -90,6 +92,8 @@ def fdk(
             yield part
 
     shape = values.shape[1], values.shape[2]
+    box = as_volume(like).boxes[0]
+    warn_of(examine(Operation.FDK, geometry, shape, images=values, grid=box), GeometryError)
     volume, doubts = checked_fdk(
         values.__getitem__, parts, geometry, shape, like, window, progress, errors=errors
     )

@@ -21,6 +21,7 @@ import numpy.typing as npt
 from flexdt.twin.errors import GeometryError, LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.plausibility import Operation, examine, warn_of
 from flexdt.twin.projection import Grid, Volume, as_volume, back, forward, gpu, room_like
 from flexdt.twin.projection.device_arrays import DeviceArray
 from flexdt.twin.projection.linear_operator import dot
@@ -110,6 +111,7 @@ class LinearSystem:
             raise GeometryError("no views; allowed: one or more", {"asked": 0, "allowed": 1})
         require_line_integrals(projections)
         values = check_projections(projections, len(geometry))
+        on_host = not gpu.is_there(values)
         require_finite(values)
         geometry.of_shape((values.shape[1], values.shape[2]))
         weights = None
@@ -121,6 +123,9 @@ class LinearSystem:
                 raise GeometryError.instead(said, list(spread.shape), wanted)
             weights = 1.0 / spread
         system = cls(values, geometry, as_volume(like), weights, hardening)
+        box, given = system.like.boxes[0], np.asarray(projections) if on_host else None
+        found = examine(Operation.ITERATE, geometry, system.shape, images=given, grid=box)
+        warn_of(found, GeometryError, stacklevel=4)
         if gpu.is_there(values) and (hardening is not None or surroundings is not None):
             said = "images on a device, with hardening or surroundings"
             raise GeometryError.instead(said, "device", "images of the host")

@@ -44,10 +44,18 @@ from flexdt.runtime.files.directory import free_memory_bytes, memory_bytes
 from flexdt.runtime.files.whole_files import free_bytes
 from flexdt.twin.algorithms import ALGORITHMS, DEFAULT, PLAIN, having
 from flexdt.twin.dataset.normalise import binned_mean
-from flexdt.twin.errors import LimitError, TwinError, UnknownNameError, require_within
+from flexdt.twin.errors import (
+    GeometryError,
+    LimitError,
+    TwinError,
+    UnknownNameError,
+    require_within,
+)
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.plausibility import Operation, PlausibilityWarning, examine, settled
+from flexdt.twin.plausibility.volume_grid import voxel_findings
 from flexdt.twin.projection import Volume, gpu
 from flexdt.twin.reconstruction import (
     Grid,
@@ -226,8 +234,16 @@ def views_of(
 
 
 def grid_of(views: ScanFrames, request: VolumeRequest) -> Grid:
-    """The grid of a requested volume."""
+    """The grid of a requested volume.
+
+    Raises:
+        GeometryError: voxels that are too large for the field of view.
+    """
     whole = field_of_view(views.cone_vec, views.shape, request.voxel_mm)
+    if request.voxel_mm is not None and request.shape is None:
+        across = field_of_view(views.cone_vec, views.shape)
+        seen_mm = across.voxel_mm * across.shape[2]
+        settled(voxel_findings(request.voxel_mm, seen_mm), GeometryError)
     shape, center = whole.shape, whole.center_mm
     if request.shape is not None:
         shape, center = request.shape, (0.0, 0.0, 0.0)
@@ -526,9 +542,15 @@ def _task(
         raise LimitError.instead(said, [name, *several], allowed)
     views = views_of(dataset, parameters, binning=wanted.binning, every=wanted.every)
     counts = CountsOnce(dataset.counts)
-    doubts = image_doubts(dataset, needed=True, counts=counts.looked_at)
+    grid = grid_of(views, wanted)
+    operation = Operation.FDK if ALGORITHMS[name].direct else Operation.ITERATE
+    half = 0.5 * grid.voxel_mm * np.array(grid.shape[::-1])
+    box = np.array([grid.center_mm - half, grid.center_mm + half])
+    found = examine(operation, views.cone_vec, views.shape, grid=box)
+    doubts = settled(found, GeometryError)
+    doubts += image_doubts(dataset, needed=True, counts=counts.looked_at)
     views = replace(views, doubts=tuple(doubts))
-    return ReconstructionTask(wanted, views, grid_of(views, wanted), counts)
+    return ReconstructionTask(wanted, views, grid, counts)
 
 
 def preview(
@@ -702,13 +724,15 @@ def _iterative(views: ScanFrames, grid: Grid, request: VolumeRequest, tell: Prog
     asked = {
         "iterations": request.iterations, "weight": request.weight, "hardening": views.mixture,
     }  # fmt: skip
-    made: Volume = algorithm.load()(
-        _stacked(views),
-        views.cone_vec,
-        grid.blank(),
-        watch=lambda step: tell(step.iteration, step.of),
-        **{name: value for name, value in asked.items() if value is not None},
-    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PlausibilityWarning)  # it is among the views' doubts
+        made: Volume = algorithm.load()(
+            _stacked(views),
+            views.cone_vec,
+            grid.blank(),
+            watch=lambda step: tell(step.iteration, step.of),
+            **{name: value for name, value in asked.items() if value is not None},
+        )
     return made
 
 

@@ -1,0 +1,104 @@
+"""The one look that every door takes at what it is given."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from enum import Enum
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.plausibility.findings import Finding
+from flexdt.twin.plausibility.pixel_values import integral_findings, volume_findings
+from flexdt.twin.plausibility.sample_placement import placement_findings
+from flexdt.twin.plausibility.scan_geometry import (
+    arc_findings,
+    geometry_findings,
+    inclination_findings,
+    span_findings,
+)
+from flexdt.twin.plausibility.volume_grid import grid_findings
+
+SOME_IMAGES = 9
+"""Images whose values are looked at."""
+SOME_PIXELS = 1 << 14
+"""Of each of them, about."""
+
+
+class Operation(Enum):
+    """What is to be done with what is examined."""
+
+    OPEN = "open"
+    PROJECT = "project"
+    SIMULATE = "simulate"
+    FDK = "FDK"
+    ITERATE = "iterate"
+
+
+def examine(
+    operation: Operation,
+    geometry: ConeVec,
+    shape: tuple[int, int] | None = None,
+    *,
+    images: Any = None,
+    volume: npt.NDArray[Any] | None = None,
+    boxes: npt.ArrayLike | None = None,
+    grid: FloatArray | None = None,
+) -> tuple[Finding, ...]:
+    """Find what contradicts itself in what an operation is given.
+
+    Args:
+        operation: what is to be done.
+        geometry: of the views.
+        shape: detector (rows, cols), or None where it is not known.
+        images: line integrals (n, rows, cols).
+        volume: values of voxels [1/mm].
+        boxes: low and high corner of the box around each part of a sample, (k, 2, 3) [mm].
+        grid: low and high corner of the volume that is to be found, (2, 3) [mm].
+
+    Example:
+        >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=np.linspace(0, 6.28, 90), pixel=0.1)
+        >>> [one.kind for one in examine(Operation.OPEN, scan, (76, 96))]
+        ['angles in radians']
+    """
+    return tuple(_found(operation, geometry, shape, images, volume, boxes, grid))
+
+
+def _found(
+    operation: Operation,
+    geometry: ConeVec,
+    shape: tuple[int, int] | None,
+    images: Any,
+    volume: npt.NDArray[Any] | None,
+    boxes: npt.ArrayLike | None,
+    grid: FloatArray | None,
+) -> Iterator[Finding]:
+    yield from geometry_findings(geometry, shape)
+    if operation is not Operation.PROJECT:
+        spans = tuple(span_findings(geometry))
+        yield from spans
+        if operation is Operation.ITERATE and not spans:
+            yield from arc_findings(geometry)
+    if images is not None:
+        yield from integral_findings(some_of(images))
+    if volume is not None:
+        yield from volume_findings(volume)
+    if boxes is not None and shape is not None:
+        exposed = operation is Operation.SIMULATE
+        yield from placement_findings(geometry, shape, boxes, exposed=exposed)
+    if grid is not None and shape is not None:
+        layers = operation is not Operation.FDK
+        yield from grid_findings(geometry, shape, grid[0], grid[1], layers=layers)
+    if grid is not None and operation is Operation.FDK:
+        yield from inclination_findings(geometry, grid.mean(axis=0))
+
+
+def some_of(images: Any) -> npt.NDArray[Any]:
+    """A few pixels of a few images: every so many rows and columns, (k, r, c)."""
+    count, rows, cols = images.shape
+    some = np.unique(np.linspace(0, count - 1, SOME_IMAGES).astype(int))
+    each = max(1, int((rows * cols / SOME_PIXELS) ** 0.5))
+    return np.stack([np.asarray(images[int(i)])[::each, ::each] for i in some])

@@ -1,0 +1,126 @@
+"""A contradiction that was found: its kind, cause, figure, remedy and severity."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final
+
+from flexdt.twin.errors import TwinError
+
+
+class Severity(IntEnum):
+    """What a door does about a finding."""
+
+    NOTE = 0
+    """Nothing; it explains other findings."""
+    WARNING = 1
+    """It warns and goes on."""
+    REFUSAL = 2
+    """It raises an error."""
+
+
+KINDS: Final[Mapping[str, str]] = {
+    "units": "lengths of one argument are in another unit than those of another",
+    "source in the sample": "the focal spot lies in the box around the sample",
+    "panel in the sample": "the panel of an exposure stands before or in the sample",
+    "sample not seen": "no ray that reaches the panel meets the sample",
+    "impossible distances": "distances or pixels that no scanner has",
+    "angles in radians": "radians where degrees belong",
+    "angles in degrees": "degrees where radians belong",
+    "limited arc": "planes that no ray of the scan runs along",
+    "laminography": "a beam inclined to the plane of rotation, given to FDK",
+    "not finite": "values that are no numbers",
+    "Hounsfield": "Hounsfield units or grey values where attenuation belongs",
+    "counts": "counts of a detector where line integrals belong",
+    "transmission": "transmission where line integrals belong",
+    "whole numbers": "line integrals whose fractions are cut off",
+    "flats disagree": "flat images of different beams",
+    "grid not seen": "voxels beside the field of view",
+    "voxel size": "voxels too large for the field of view",
+    "angles disagree": "the angles of a file and those of the geometry",
+    "order": "the file's angles are the geometry's in another order",
+    "pixel size disagrees": "the pixel of a file and that of the geometry",
+    "duplicate": "two files with one number",
+    "gap": "a number missing between those of other files",
+    "other name": "a file named otherwise than the other images",
+    "no data": "images in which nothing was recorded",
+}
+"""Kind of contradiction -> what it means."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What contradicts what.
+
+    Attributes:
+        kind: one of `KINDS`.
+        cause: what was found, with its figure and unit.
+        remedy: what the user can do.
+        severity: what a door does about it.
+        figure: the figure by which it was found, in the unit that `cause` says.
+    """
+
+    kind: str
+    cause: str
+    remedy: str
+    severity: Severity
+    figure: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise KeyError(self.kind)
+
+    @property
+    def said(self) -> str:
+        """Cause and remedy in one sentence."""
+        return f"{self.cause}; {self.remedy}"
+
+
+class PlausibilityWarning(UserWarning):
+    """A warning of what `examine` found."""
+
+
+def warn_of(
+    findings: Iterable[Finding], error: type[TwinError] = TwinError, *, stacklevel: int = 3
+) -> None:
+    """Refuse as `settled` does, and warn of the rest.
+
+    Args:
+        findings: of one door.
+        error: that is raised.
+        stacklevel: of the door's caller, seen from the door.
+    """
+    for doubt in settled(findings, error):
+        warnings.warn(doubt, PlausibilityWarning, stacklevel=stacklevel + 1)
+
+
+def settled(
+    findings: Iterable[Finding], error: type[TwinError] = TwinError, where: str = ""
+) -> list[str]:
+    """Refuse, or give what is to be warned of.
+
+    Args:
+        findings: of one door.
+        error: that is raised.
+        where: goes before each sentence, such as a path.
+
+    Raises:
+        TwinError: of the type `error`, for the first finding that is a refusal.
+
+    Example:
+        >>> doubt = Finding("gap", "no image 17", "give 359 views", Severity.WARNING)
+        >>> settled([doubt], where="scans")
+        ['scans: no image 17; give 359 views']
+    """
+    before = f"{where}: " if where else ""
+    told = []
+    for one in findings:
+        if one.severity is Severity.REFUSAL:
+            facts = {"check": one.kind, "asked": one.figure, "allowed": one.remedy}
+            raise error(before + one.said, facts)
+        if one.severity is Severity.WARNING:
+            told.append(before + one.said)
+    return told

@@ -1,0 +1,113 @@
+"""Values of images and volumes: line integrals, counts, transmission, attenuation, Hounsfield."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.plausibility.findings import Finding, Severity
+
+EDGE_PART: Final = 0.06
+"""Of an image's columns, or rows, that lie at its edges."""
+OPEN: Final = (0.95, 1.05)
+"""Transmission of the open beam."""
+SAME_BEAM: Final = 0.05
+"""Share of pixels that the open beam must have."""
+DARKER: Final = 0.85
+"""Transmission behind an object, relative to the open beam."""
+MOST_BRIGHT: Final = 0.02
+"""Share of pixels that noise makes brighter than the open beam by a fifth."""
+COUNTED: Final = 25.0
+"""Line integrals above which no photon passes: of fewer than 1e-10 photons."""
+MOST_PER_MM: Final = 200.0
+"""No element attenuates more at energies of tubes [1/mm]."""
+LEAST_HOUNSFIELD: Final = -200.0
+"""A volume of attenuation goes below zero by artefacts alone, never so far."""
+
+
+def integral_findings(images: npt.NDArray[Any]) -> Iterator[Finding]:
+    """Find what is given as line integrals and is something else.
+
+    Args:
+        images: some of the scan's, (k, rows, cols).
+    """
+    values = np.asarray(images)
+    if not values.size:
+        return
+    if values.dtype.kind in "ui" and int(values.max()) > COUNTED:
+        cause = f"line integrals of {values.dtype} up to {values.max()}, as counts have"
+        yield Finding("counts", cause, _FROM_COUNTS, Severity.REFUSAL, float(values.max()))
+        return
+    if values.dtype.kind in "ui" and values.any():
+        cause = f"line integrals of {values.dtype} have no fractions"
+        remedy = "give floating-point numbers"
+        yield Finding("whole numbers", cause, remedy, Severity.WARNING, float(values.max()))
+        return
+    beam = _beam(values)
+    if beam is None:
+        return
+    darker = float((values < DARKER * beam).mean())
+    brighter = float((values > 1.2 * beam).mean())
+    if beam > COUNTED and brighter < MOST_BRIGHT:
+        cause = f"line integrals of {beam:.4g} at the images' edges, less behind the object"
+        yield Finding("counts", cause, _FROM_COUNTS, Severity.REFUSAL, beam)
+    elif OPEN[0] < beam < OPEN[1] and darker > 1e-3 and brighter < MOST_BRIGHT:
+        open_share = float(((values > OPEN[0] * beam) & (values < OPEN[1] * beam)).mean())
+        if open_share > SAME_BEAM and float(np.quantile(values, 1e-3)) > -0.1:
+            cause = (
+                f"values are {beam:.3g} at the images' edges and less behind the object, as "
+                "transmission is"
+            )
+            remedy = "line integrals are -np.log of it"
+            yield Finding("transmission", cause, remedy, Severity.WARNING, beam)
+
+
+_FROM_COUNTS: Final = "give counts with their flat image, as DataSet.from_arrays(counts, flat=)"
+
+
+def _beam(images: npt.NDArray[Any]) -> float | None:
+    """The value at the images' left and right edges, where both are alike; None where not."""
+    wide = max(1, int(EDGE_PART * images.shape[2]))
+    edges = images[:, :, :wide], images[:, :, -wide:]
+    left, right = (float(np.median(edge)) for edge in edges)
+    if not abs(left - right) <= 0.1 * max(abs(left), abs(right)):
+        return None
+    return 0.5 * (left + right)
+
+
+def volume_findings(values: npt.NDArray[Any]) -> Iterator[Finding]:
+    """Find what is given as attenuation and is something else.
+
+    Args:
+        values: of the voxels (nz, ny, nx).
+    """
+    data = np.asarray(values)
+    if not data.size or data.dtype.kind not in "fiu":
+        return
+    with np.errstate(invalid="ignore"):
+        total = float(data.sum(dtype=np.float64))
+    if not np.isfinite(total):
+        bad = ~np.isfinite(data)
+        if bad.any():
+            share = float(bad.mean())
+            cause = (
+                f"{100 * share:.3g} % of the voxels are no numbers, as beside the field of view: "
+                "neither are line integrals through them"
+            )
+            remedy = "give them a value first, such as np.nan_to_num(volume.data)"
+            yield Finding("not finite", cause, remedy, Severity.WARNING, share)
+        low = float(np.nanmin(np.where(bad, np.nan, data))) if not bad.all() else 0.0
+        high = float(np.nanmax(np.where(bad, np.nan, data))) if not bad.all() else 0.0
+    else:
+        low, high = float(data.min()), float(data.max())
+    if low < LEAST_HOUNSFIELD:
+        cause = f"attenuation from {low:.5g} to {high:.5g} /mm, as Hounsfield units are"
+        remedy = "attenuation is mu_water * (1 + HU / 1000), some 0.02 /mm of water"
+        yield Finding("Hounsfield", cause, remedy, Severity.REFUSAL, low)
+    elif high > MOST_PER_MM:
+        cause = f"attenuation of up to {high:.5g} /mm, more than any element has"
+        remedy = "grey values need a scale to 1/mm, labels material={1: NAME}"
+        yield Finding("Hounsfield", cause, remedy, Severity.WARNING, high)

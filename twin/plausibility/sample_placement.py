@@ -1,0 +1,101 @@
+"""Where a geometry meets a sample: numbers that fit no scan, such as metres for mm."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.virtual_panel import stretches
+from flexdt.twin.plausibility.findings import Finding, Severity
+
+MOST_MAGNIFIED: Final = 1000.0
+"""No tube has a focal spot that is worth more."""
+MOST_OVERSIZE: Final = 100.0
+"""Size of a sample's shadow, relative to the panel, above which lengths are of two units."""
+FEWEST_PIXELS: Final = 16
+"""Rows and columns of a panel that is one, and not a few rays through a sample."""
+UNITS: Final = "are all lengths in mm?"
+
+
+def placement_findings(
+    cone_vec: ConeVec, shape: tuple[int, int], boxes: npt.ArrayLike, *, exposed: bool = False
+) -> Iterator[Finding]:
+    """Find what is doubtful about the views of a sample.
+
+    Args:
+        cone_vec: the views.
+        shape: detector (rows, cols).
+        boxes: low and high corner of the box around each part of the sample, (k, 2, 3) [mm].
+        exposed: images are exposed, so that the panel is no virtual one.
+
+    Example:
+        >>> scan = ConeVec.circular(sod=0.6, sdd=1.06, angles=4, pixel=1.5e-4)
+        >>> found = placement_findings(scan, (760, 956), [[[-5, -5, -5], [5, 5, 5]]])
+        >>> [one.said for one in found]
+        ['the source is inside the box around the sample in 4 of 4 views; are all lengths in mm?']
+    """
+    parts = np.asarray(boxes, dtype=np.float64)
+    if not len(parts) or not len(cone_vec):
+        return
+    low, high = parts[:, 0].min(axis=0), parts[:, 1].max(axis=0)
+    inside = np.zeros(len(cone_vec), bool)
+    for part in parts:
+        inside |= ((cone_vec.source > part[0]) & (cone_vec.source < part[1])).all(axis=1)
+    if inside.any():
+        count = f"{inside.sum()} of {len(inside)} views"
+        cause = f"the source is inside the box around the sample in {count}"
+        yield Finding("source in the sample", cause, UNITS, Severity.WARNING, float(inside.mean()))
+        return
+    toward = cone_vec.normal * np.sign(cone_vec.source_detector_distance)[:, None]
+    distance = np.abs(cone_vec.source_detector_distance)
+    corners = np.array(list(product(*np.stack([low, high], axis=1))))
+    depths = np.einsum("nki,ni->nk", corners - cone_vec.source[:, None], toward)
+    places = cone_vec.project_points(corners, shape)
+    seen = _seen(places, depths > 0.0, shape)
+    if not seen.any():
+        cause = "the sample is outside every view: no ray that reaches the panel meets it"
+        yield Finding("sample not seen", cause, UNITS, Severity.WARNING, 0.0)
+        return
+    cut = stretches(cone_vec, corners) > 1.0
+    if exposed and cut.any():
+        cause = (
+            f"the panel stands before or in the box around the sample in {cut.sum()} of {len(cut)} "
+            "views: rays run through it, as through a virtual one"
+        )
+        yield Finding("panel in the sample", cause, UNITS, Severity.WARNING, float(cut.mean()))
+        return
+    magnified = float((distance / np.maximum(depths.mean(axis=1), 1e-9)).max())
+    pixel = float(np.linalg.norm(cone_vec.u, axis=1).max())
+    if magnified > MOST_MAGNIFIED:
+        cause = f"the magnification is {magnified:.4g}, above {MOST_MAGNIFIED:g}"
+        yield Finding("units", cause, UNITS, Severity.WARNING, magnified)
+    if (largest := float((high - low).max())) * magnified < pixel:
+        cause = (
+            f"the sample measures {largest:.3g} mm, magnified {magnified:.3g} times less than a "
+            f"pixel of {pixel:.3g} mm"
+        )
+        yield Finding("units", cause, UNITS, Severity.WARNING, largest)
+    ahead = (depths > 0.0).all(axis=1)
+    if ahead.all() and min(shape) >= FEWEST_PIXELS:
+        times = float((np.ptp(places, axis=1) / shape[::-1]).min(axis=1).min())
+        if times > MOST_OVERSIZE:
+            cause = f"the sample's shadow is {times:.3g} times as large as the panel in every view"
+            yield Finding("units", cause, UNITS, Severity.WARNING, times)
+
+
+def _seen(
+    places: FloatArray, ahead: npt.NDArray[np.bool_], shape: tuple[int, int]
+) -> npt.NDArray[np.bool_]:
+    """Views on whose panel a box may cast a shadow, (n,), from its corners' images (n, 8, 2).
+
+    A box that the source's plane crosses may be anywhere.
+    """
+    far = np.array(shape[::-1]) - 0.5
+    overlap = (places.max(axis=1) > -0.5) & (places.min(axis=1) < far)
+    return np.asarray(ahead.any(axis=1) & (overlap.all(axis=1) | ~ahead.all(axis=1)))

@@ -1,0 +1,225 @@
+"""A scan's geometry by itself: distances, units, and what its angles cover for a method."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.plausibility.findings import Finding, Severity
+
+WIDEST_DEG: Final = 120.0
+"""Angle under which no source sees a whole panel."""
+MOST_PITCH: Final = 0.5
+"""Pitch of a pixel relative to the distance of source and panel that no panel has."""
+RADIANS_SPAN: Final = 4 * math.pi * 1.01
+"""Spans up to two turns of radians; as degrees they are a few degrees."""
+RADIANS_VIEWS: Final = 8
+"""Views from which on so narrow a span is doubtful."""
+MOST_TURNS: Final = 20.0
+"""Turns of a circular scan above which its angles are degrees for radians."""
+FEW_A_TURN: Final = 12.0
+"""Views a turn below which several turns of equal steps are degrees for radians."""
+GOLDEN: Final = (math.pi * (3 - math.sqrt(5)), math.pi * (math.sqrt(5) - 1))
+"""Steps of golden ratio between views, whose turns overlap by intention [rad]."""
+MISSING_DEG: Final = (12.0, 30.0)
+"""Gaps of directions from which an arc is limited, where views are even, and else."""
+TIMES_USUAL: Final = (8.0, 5.0)
+"""So many usual steps the same gaps must have."""
+INCLINED_DEG: Final = (10.0, 20.0)
+"""Inclination of the beam to the plane of rotation that FDK is warned of, and refuses."""
+FDK_TOO: Final = "an iterative method (sirt, cgls, tv) takes any trajectory"
+
+
+def distance_findings(
+    sod: float, sdd: float, pixel: npt.ArrayLike, names: tuple[str, str] = ("SOD", "SDD")
+) -> Iterator[Finding]:
+    """Refuse distances and pixels that a file or dictionary states and no scanner has.
+
+    Args:
+        sod, sdd: source to axis and to panel [mm].
+        pixel: pitches [mm].
+        names: of the distances, as the file has them.
+    """
+    pitches = np.atleast_1d(np.asarray(pixel, dtype=np.float64))
+    if not (math.isfinite(sod) and math.isfinite(sdd) and 0.0 < sod <= sdd):
+        cause = f"{names[0]} is {sod:g} mm and {names[1]} {sdd:g} mm"
+        allowed = f"allowed: 0 < {names[0]} <= {names[1]}"
+        yield Finding("impossible distances", cause, allowed, Severity.REFUSAL, sod)
+        return
+    if not (np.isfinite(pitches).all() and (pitches > 0.0).all()):
+        cause = f"the pixel is {' x '.join(f'{p:g}' for p in pitches)} mm"
+        yield Finding(
+            "impossible distances", cause, "allowed: above 0", Severity.REFUSAL, float(pitches[0])
+        )
+        return
+    if float(pitches.max()) > MOST_PITCH * sdd:
+        cause = f"{names[1]} is {sdd:g} mm with pixels of {pitches.max():g} mm"
+        allowed = f"allowed: pixels below {MOST_PITCH:g} times {names[1]}; are all lengths in mm?"
+        yield Finding("impossible distances", cause, allowed, Severity.REFUSAL, sdd)
+
+
+def geometry_findings(cone_vec: ConeVec, shape: tuple[int, int] | None) -> Iterator[Finding]:
+    """Find what no scanner has in the rows of a geometry.
+
+    Args:
+        cone_vec: n views.
+        shape: detector (rows, cols), or None.
+    """
+    if not len(cone_vec):
+        return
+    distance = np.abs(cone_vec.source_detector_distance)
+    pitch = np.maximum(np.linalg.norm(cone_vec.u, axis=1), np.linalg.norm(cone_vec.v, axis=1))
+    worst = int(np.argmax(pitch - MOST_PITCH * distance))
+    if pitch[worst] > MOST_PITCH * distance[worst]:
+        cause = (
+            f"view {worst}: the panel is {distance[worst]:.3g} mm from the source, its pixels "
+            f"measure {pitch[worst]:.3g} mm"
+        )
+        allowed = f"allowed: pixels below {MOST_PITCH:g} times the distance; are all lengths in mm?"
+        figure = float(pitch[worst] / max(distance[worst], 1e-300))
+        yield Finding("impossible distances", cause, allowed, Severity.REFUSAL, figure)
+        return
+    if shape is None:
+        return
+    ends = cone_vec.rays(shape)
+    across = (shape[1] - 1) * ends[:, 6:9]
+    first = ends[:, 3:6] + 0.5 * (shape[0] - 1) * ends[:, 9:12]
+    last = first + across
+    lengths = np.linalg.norm(first, axis=1) * np.linalg.norm(last, axis=1)
+    cosine = np.einsum("ni,ni->n", first, last) / np.maximum(lengths, 1e-300)
+    fan = float(np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0))).max())
+    if fan > WIDEST_DEG:
+        wide = float(np.linalg.norm(across, axis=1).max())
+        cause = (
+            f"the source sees the panel of {wide:.4g} mm under {fan:.3g} deg, pixels of "
+            f"{pitch.max():.3g} mm at {distance.min():.4g} mm"
+        )
+        yield Finding("units", cause, "are all lengths in mm?", Severity.WARNING, fan)
+
+
+def radian_findings(angles: npt.ArrayLike) -> Iterator[Finding]:
+    """Find degrees in angles of a circular scan that are to be radians, (n,).
+
+    Example:
+        >>> [one.kind for one in radian_findings(np.arange(0, 360, 2))]
+        ['angles in degrees']
+        >>> list(radian_findings(np.deg2rad(np.arange(0, 360, 2))))
+        []
+    """
+    given = np.asarray(angles, dtype=np.float64).ravel()
+    if len(given) < RADIANS_VIEWS or not np.isfinite(given).all():
+        return
+    span = float(np.ptp(given))
+    turns = span / math.tau
+    if turns < 2.5:
+        return
+    steps = np.diff(np.sort(given))
+    usual = float(np.median(steps))
+    if any(abs(usual / step - 1.0) < 1e-4 for step in GOLDEN):
+        return
+    few = len(given) / turns < FEW_A_TURN and _round_degrees(span, usual)
+    if turns > MOST_TURNS or few:
+        cause = f"the angles span {span:.4g} rad, {turns:.3g} turns of {len(given)} views"
+        remedy = "were degrees given? ASTRA's are radians: np.deg2rad(angles)"
+        yield Finding("angles in degrees", cause, remedy, Severity.WARNING, span)
+
+
+def _round_degrees(span: float, step: float) -> bool:
+    """Whether a span, or with a step, is a number of degrees that scans have."""
+    return any(
+        abs(whole / 5.0 - round(whole / 5.0)) < 2e-3 and whole > 0 for whole in (span, span + step)
+    )
+
+
+def arc_deg(cone_vec: ConeVec) -> float:
+    """The angle that the views of a circular scan run through [deg]."""
+    azimuth = _azimuths(cone_vec)
+    at = np.sort(azimuth % math.tau)
+    gaps = np.diff(at, append=at[0] + math.tau)
+    return float(np.rad2deg(math.tau - gaps.max()))
+
+
+def _azimuths(cone_vec: ConeVec) -> FloatArray:
+    """Of each view's beam about z, (n,) [rad]."""
+    beam = cone_vec.detector - cone_vec.source
+    return np.asarray(np.arctan2(beam[:, 1], beam[:, 0]))
+
+
+def _about_z(cone_vec: ConeVec) -> bool:
+    """Whether the views turn about z at one inclination, as those of a circle or helix do."""
+    beam = cone_vec.detector - cone_vec.source
+    level = np.hypot(beam[:, 0], beam[:, 1])
+    if not (level > 0.05 * np.linalg.norm(beam, axis=1)).all():
+        return False
+    return float(np.ptp(np.arctan2(beam[:, 2], level))) < 0.2
+
+
+def span_findings(cone_vec: ConeVec) -> Iterator[Finding]:
+    """Find radians given as degrees: many views within a few degrees."""
+    if len(cone_vec) < RADIANS_VIEWS or not _about_z(cone_vec):
+        return
+    span = arc_deg(cone_vec)
+    if 0.0 < span < RADIANS_SPAN:
+        cause = f"{len(cone_vec)} views span {span:.4g} deg"
+        remedy = f"were radians given as degrees? np.rad2deg makes them {np.rad2deg(span):.4g}"
+        yield Finding("angles in radians", cause, remedy, Severity.WARNING, span)
+
+
+def arc_findings(cone_vec: ConeVec) -> Iterator[Finding]:
+    """Find directions that no view has, for a method that takes any trajectory."""
+    if len(cone_vec) < 3 or not _about_z(cone_vec):
+        return
+    at = np.unique((_azimuths(cone_vec) % math.pi).round(6) % round(math.pi, 6))
+    if len(at) < 3:
+        return
+    gaps = np.rad2deg(np.diff(at, append=at[0] + math.pi))
+    widest = float(gaps.max())
+    usual = (180.0 - widest) / (len(gaps) - 1)
+    limited = any(
+        widest - usual > least and widest > times * usual
+        for least, times in zip(MISSING_DEG, TIMES_USUAL, strict=True)
+    )
+    if limited:
+        cause = (
+            f"the views leave out {widest:.3g} of 180 deg of directions: edges along those are "
+            "blurred or missing, and values off"
+        )
+        remedy = "views over half a turn and the fan are needed for a volume that is right"
+        yield Finding("limited arc", cause, remedy, Severity.WARNING, widest)
+
+
+def inclination_findings(cone_vec: ConeVec, centre: npt.ArrayLike) -> Iterator[Finding]:
+    """Find laminography: a beam inclined to the plane of rotation, of which FDK knows nothing.
+
+    Args:
+        cone_vec: views of a circle about z.
+        centre: of the grid [mm].
+    """
+    if (
+        len(cone_vec) < 3
+        or not _about_z(cone_vec)
+        or np.ptp(cone_vec.source[:, 2]) > 1e-3 * (np.abs(cone_vec.source_detector_distance).max())
+    ):
+        return
+    beam = cone_vec.detector - cone_vec.source
+    towards = np.asarray(centre, dtype=np.float64) - cone_vec.source
+    angles = [
+        np.rad2deg(np.arctan2(ray[:, 2], np.hypot(ray[:, 0], ray[:, 1]))) for ray in (beam, towards)
+    ]
+    if np.sign(angles[0].mean()) != np.sign(angles[1].mean()):
+        return
+    inclined = float(min(np.abs(one).min() for one in angles))
+    if inclined > INCLINED_DEG[0]:
+        cause = (
+            f"the beam is inclined by {inclined:.3g} deg to the plane in which the source turns "
+            "(laminography), where FDK is wrong"
+        )
+        refused = inclined > INCLINED_DEG[1]
+        severity = Severity.REFUSAL if refused else Severity.WARNING
+        yield Finding("laminography", cause, FDK_TOO, severity, inclined)

@@ -1,0 +1,100 @@
+"""A volume's grid against the field of view."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.plausibility.findings import Finding, Severity
+
+SOME_VIEWS: Final = 60
+POINTS: Final = 7
+"""Points along each axis of a grid that are looked at."""
+MOST_UNSEEN: Final = 0.5
+"""Share of a grid's points that lie beside the field of view; of a square about a circle, .21."""
+BEHIND: Final = 0.25
+"""Share of the views that see a grid behind the panels of all."""
+SELDOM: Final = 0.25
+"""Share of views that see a point beside the field of view, relative to the point seen most."""
+FEWEST_VOXELS: Final = 4
+"""Voxels across a field of view."""
+
+
+def grid_findings(
+    cone_vec: ConeVec,
+    shape: tuple[int, int],
+    low: FloatArray,
+    high: FloatArray,
+    *,
+    layers: bool = True,
+) -> Iterator[Finding]:
+    """Find grids beside the field of view.
+
+    Args:
+        cone_vec: n views.
+        shape: detector (rows, cols).
+        low, high: corners of the grid, (3,) [mm].
+        layers: those above and below the panel count; FDK makes them NaN and says so.
+    """
+    if not len(cone_vec) or max(shape) < 2 or (not layers and shape[1] < 2):
+        return
+    some = np.unique(np.linspace(0, len(cone_vec) - 1, SOME_VIEWS).astype(int))
+    views = cone_vec[some]
+    parts = (np.arange(POINTS) + 0.5) / POINTS
+    axes = [a + parts * (b - a) for a, b in zip(low, high, strict=True)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    with np.errstate(all="ignore"):
+        at = views.project_points(points, shape)
+        toward = views.normal * np.sign(views.source_detector_distance)[:, None]
+        depth = np.einsum("nki,ni->nk", points - views.source[:, None], toward)
+        ahead, before = depth > 0.0, depth <= np.abs(views.source_detector_distance)[:, None]
+        on = (at > -0.5) & (at < np.array(shape[::-1]) - 0.5)
+    on_side = np.abs(views.u[:, 2]).mean() > np.abs(views.v[:, 2]).mean()
+    beside = on.all(axis=2) if layers else on[..., int(on_side)]
+    shown = beside & ahead
+    if (shown & before).any():
+        shown = shown & before
+    elif shown.mean(axis=0).max() < BEHIND:  # a panel before the whole object is a virtual one
+        shown = np.zeros_like(shown)
+    times = shown.mean(axis=0)
+    if not times.any() and not _crossed(at, ahead & before, shape):
+        size = " x ".join(f"{b - a:.4g}" for a, b in zip(low, high, strict=True))
+        middle = ", ".join(f"{(a + b) / 2:.4g}" for a, b in zip(low, high, strict=True))
+        cause = f"no view sees any of the grid of {size} mm about ({middle}) mm (x, y, z)"
+        remedy = "allowed: a grid in the field of view; are all lengths in mm?"
+        yield Finding("grid not seen", cause, remedy, Severity.REFUSAL, 0.0)
+        return
+    unseen = float((times < SELDOM * times.max()).mean())
+    if unseen > MOST_UNSEEN:
+        cause = (
+            f"{100 * unseen:.3g} % of the grid lie beside the field of view, where values are not "
+            "determined"
+        )
+        remedy = "a smaller grid, such as field_of_view gives, holds what was seen"
+        yield Finding("grid not seen", cause, remedy, Severity.WARNING, unseen)
+
+
+def _crossed(at: FloatArray, ahead: FloatArray, shape: tuple[int, int]) -> bool:
+    """Whether the shadow of the grid's points, as a whole, may meet the panel in some view.
+
+    Args:
+        at: their images, (n, k, 2) pixels.
+        ahead: which of them lie between source and panel, (n, k).
+        shape: detector (rows, cols).
+    """
+    far = np.array(shape[::-1]) - 0.5
+    low = np.where(ahead[..., None], at, np.inf).min(axis=1)
+    high = np.where(ahead[..., None], at, -np.inf).max(axis=1)
+    return bool(((high > -0.5) & (low < far)).all(axis=1).any())
+
+
+def voxel_findings(voxel_mm: float, view_mm: float) -> Iterator[Finding]:
+    """Refuse voxels that a field of view of `view_mm` across holds too few of."""
+    if voxel_mm * FEWEST_VOXELS > view_mm:
+        cause = f"voxels of {voxel_mm:g} mm in a field of view of {view_mm:.4g} mm across"
+        remedy = f"allowed: below {view_mm / FEWEST_VOXELS:.3g} mm; is the voxel in mm?"
+        yield Finding("voxel size", cause, remedy, Severity.REFUSAL, voxel_mm)
