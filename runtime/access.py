@@ -64,7 +64,11 @@ class TwinLimits:
 
     Attributes:
         max_jobs: jobs in the queue.
+        max_ended_jobs: ended jobs that are known; beyond them the oldest is forgotten.
+        ended_job_days: after which an ended job is forgotten [days].
         max_upload: size of an uploaded sample [bytes].
+        max_samples: uploads there may be.
+        max_corrections: corrections there may be.
         disk_quota: of the data directory [bytes]; None: what the disk holds.
         max_subscriptions: topics that all connections together follow.
         max_views: different kinds and binnings in which they want their events; an image is
@@ -74,7 +78,11 @@ class TwinLimits:
     """
 
     max_jobs: int = 1000
+    max_ended_jobs: int = 1000
+    ended_job_days: float = 365.0
     max_upload: int = 512 << 20
+    max_samples: int = 10_000
+    max_corrections: int = 10_000
     disk_quota: int | None = None
     max_subscriptions: int = 2048
     max_views: int = 16

@@ -58,6 +58,10 @@ COMMANDS: Final[Mapping[str, Callable[..., object]]] = {
 GROUPS: Final[Mapping[str, tuple[str, Mapping[str, Callable[..., object]]]]] = {
     "script": ("Scan scripts.", {"new": scripts.new}),
     "job": ("Jobs: scripts and trajectories being run.", jobs.JOB_COMMANDS),
+    "delete": (
+        "What a twin keeps, deleted.",
+        {"sample": scanner.delete_sample, "correction": scanner.delete_correction},
+    ),
     "phantom": (
         "Phantoms: objects to scan.",
         {"list": phantoms.list_phantoms, "make": phantoms.make},
@@ -93,7 +97,7 @@ ALONE: Final = ("twin", "projector", "viewer", "gateway")
 """Commands that pass their words on to a process, `--help` among them."""
 SECTIONS: Final[Mapping[str, tuple[str, ...]]] = {
     "Scanner": ("state", "move", "jog", "stop", "estop", "reset", "tube", "camera", "clock",
-                "sample", "snap"),
+                "sample", "delete", "snap"),
     "Scans": ("script", "check", "expose", "run", "job", "follow"),
     "Data": ("calibrate", "align", "compare", "reconstruct", "export", "import", "simulate"),
     "Analysis": ("phantom", "machine", "commission", "study", "batch", "bench", "evidence"),

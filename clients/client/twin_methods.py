@@ -259,6 +259,18 @@ def set_sample(
     return ask(scanner.SAMPLE_SET, name=name, file=file, material=material, offset=place)
 
 
+def delete_sample(name: str) -> Flow[scanner.SampleDeleteResult]:
+    """Delete an upload that neither stands on the stage nor is in a scan that has not ended.
+
+    Example:
+        >>> import numpy as np
+        >>> sent = twin.upload_voxels(np.full((2, 2, 2), 0.02), 0.5, "grain")
+        >>> twin.delete_sample("grain").bytes
+        32
+    """
+    return ask(scanner.SAMPLE_DELETE, name=name)
+
+
 def sample_mesh() -> Flow[bytes]:
     """The shape of the sample on the stage: binary STL in mm, in the sample's own frame.
 
@@ -689,6 +701,19 @@ def abort_job(job: str | None = None, reason: str | None = None) -> Flow[s.JobSt
     return ask(scans.JOB_ABORT, job=job, reason=reason)
 
 
+def forget_job(job: str | None = None, *, days: float | None = None) -> Flow[scans.JobForgetResult]:
+    """Forget an ended job, or all that ended at least `days` ago; data sets stay.
+
+    Example:
+        >>> job = twin.submit_trajectory([{"rot_obj": 0.0}], 90.0, speed_up="max").job
+        >>> twin.wait_job(job).state
+        'done'
+        >>> twin.forget_job(job).jobs == [job]
+        True
+    """
+    return ask(scans.JOB_FORGET, job=job, days=days)
+
+
 def wait_job(
     job: str | None = None,
     progress: Callable[[s.JobStatus], object] | None = None,
@@ -862,6 +887,20 @@ def revert_calibration() -> Flow[corrections.CorrectionResult]:
         True
     """
     return ask(corrections.CALIBRATION_REVERT)
+
+
+def delete_calibration(name: str) -> Flow[corrections.CorrectionDeleted]:
+    """Delete a correction that is not in force; data sets keep theirs.
+
+    Example:
+        >>> twin.apply_calibration({"det_roll": 0.3}, "slip").correction.name
+        'slip'
+        >>> twin.revert_calibration().correction is None
+        True
+        >>> twin.delete_calibration("slip").name
+        'slip'
+    """
+    return ask(corrections.CALIBRATION_DELETE, name=name)
 
 
 def fit_calibration(

@@ -165,6 +165,19 @@ class CalibrationApply(f.Params):
     source: f.ShortText | None = None
 
 
+class CalibrationDelete(f.Params):
+    """Which correction to delete."""
+
+    name: f.Name
+    """of a correction that is not in force"""
+
+
+class CorrectionDeleted(f.Result):
+    """The correction that is not known any more; data sets keep theirs."""
+
+    name: str
+
+
 class CalibrationGet(f.Params):
     """Which correction; the one in force if left out."""
 
@@ -301,6 +314,8 @@ CALIBRATION_GET = read("calibration.get", CalibrationGet, CorrectionResult,
 CALIBRATION_LIST = read("calibration.list", f.Empty, CorrectionListResult, "all corrections")
 CALIBRATION_REVERT = command("calibration.revert", f.Empty, CorrectionResult,
                              "back to the correction before")  # fmt: skip
+CALIBRATION_DELETE = command("calibration.delete", CalibrationDelete, CorrectionDeleted,
+                             "delete a correction that is not in force")  # fmt: skip
 CALIBRATION_FIT = read("calibration.fit", CalibrationFit, CalibrationFitResult,
                        "calibrate from data sets", limits=FIT_LIMITS)  # fmt: skip
 CALIBRATION_ALIGN = read("calibration.align", CalibrationAlign, CalibrationAlignResult,

@@ -83,6 +83,27 @@ class JobAbort(JobRef):
     ] = None
 
 
+class JobForget(f.Params):
+    """Which ended jobs to forget: one, or all that ended so long ago."""
+
+    job: Annotated[f.ShortText, Len(1, 120)] | None = None
+    """that has ended"""
+    days: Annotated[float, Ge(0), Le(1e6)] | None = None
+    """instead: all jobs that ended at least so many days ago; 0: all that have ended"""
+
+    @model_validator(mode="after")
+    def _one(self) -> JobForget:
+        if (self.job is None) == (self.days is None):
+            raise ValueError("give either job or days")
+        return self
+
+
+class JobForgetResult(f.Result):
+    """The jobs that are not known any more; their data sets stay."""
+
+    jobs: list[str]
+
+
 class Problem(f.Result):
     """Something about a script, with its place."""
 
@@ -155,3 +176,5 @@ JOB_STEP = command("job.step", JobRef, JobStatus, "run a paused job for one step
 JOB_ABORT = Method("job.abort", JobAbort, JobStatus,
                    "end a job, its data set incomplete", urgent=True)  # fmt: skip
 JOB_LIST = read("job.list", f.Empty, JobListResult, "all jobs, oldest first")
+JOB_FORGET = command("job.forget", JobForget, JobForgetResult,
+                     "forget ended jobs; data sets stay")  # fmt: skip

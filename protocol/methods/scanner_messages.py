@@ -201,6 +201,21 @@ class SampleUpload(f.Params):
         return self
 
 
+class SampleDelete(f.Params):
+    """Which upload to delete."""
+
+    name: f.Name
+    """of an upload that neither stands on the stage nor is in a scan that has not ended"""
+
+
+class SampleDeleteResult(f.Result):
+    """What was deleted."""
+
+    name: str
+    bytes: int
+    """of the upload"""
+
+
 class SampleResult(f.Result):
     """What stands on the stage now."""
 
@@ -255,3 +270,4 @@ SAMPLE_MESH = read("sample.mesh", SampleMesh, SampleMeshResult,
                    "the shape of the sample on the stage")  # fmt: skip
 SAMPLE_UPLOAD = Method("sample.upload", SampleUpload, UploadResult,
                        "send a mesh, voxels or a scene in chunks", bulky=True)  # fmt: skip
+SAMPLE_DELETE = command("sample.delete", SampleDelete, SampleDeleteResult, "delete an upload")

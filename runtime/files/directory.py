@@ -241,6 +241,17 @@ class Directory:
         with self._opened() as fd:
             os.unlink(self._at(name), dir_fd=fd)
 
+    def discard(self, name: str) -> None:
+        """Delete an entry that is no directory, and make that safe; none there is fine.
+
+        Raises:
+            DatasetWriteError: the system refuses.
+        """
+        refused = writing(self.path / name, f"cannot delete {self.path / name}")
+        with refused, suppress(FileNotFoundError, NotADirectoryError):
+            self.unlink(name)
+            self.sync()
+
     def stat(self, name: str) -> os.stat_result | None:
         """What an entry is, a link itself; None where there is none.
 

@@ -63,19 +63,38 @@ class Changes:
     """
 
     def __init__(self) -> None:
-        self._made: list[tuple[Directory, str, str | None, bytes]] = []
+        self._made: list[tuple[Directory, str, str | None, bytes | None]] = []
+        """Folder, name, the name under which what was there is kept, and what is there now."""
 
     def put(self, folder: Directory, name: str, data: bytes) -> None:
         """Write a file, as `Directory.keep`."""
-        before = f"{BEFORE}{os.getpid()}-{threading.get_native_id()}-{len(self._made)}"
+        before = self._before()
         kept = before if _second_name(folder, name, before) else None
         self._made.append((folder, name, kept, data))
         folder.keep(name, data)
+
+    def remove(self, folder: Directory, name: str) -> None:
+        """Delete a file, safely; none there is fine.
+
+        Raises:
+            DatasetWriteError: the system refuses.
+        """
+        before = self._before()
+        with writing(folder.path / name, f"cannot delete {folder.path / name}"):
+            try:
+                folder.rename(name, before)
+            except (FileNotFoundError, NotADirectoryError):
+                return
+            self._made.append((folder, name, before, None))
+            folder.sync()
 
     def put_json(self, folder: Directory, name: str, document: object) -> None:
         """Write a JSON document, as `put`."""
         data = json.dumps(document, indent=1, allow_nan=False).encode("utf-8")
         self.put(folder, name, data)
+
+    def _before(self) -> str:
+        return f"{BEFORE}{os.getpid()}-{threading.get_native_id()}-{len(self._made)}"
 
     def __enter__(self) -> Changes:
         return self
@@ -98,7 +117,7 @@ class Changes:
         """Restore each file unless somebody else has changed it since; failures are logged."""
         for folder, name, before, data in reversed(self._made):
             try:
-                if folder.read(name, max(LARGEST, len(data))) != data:
+                if not _is_still(folder, name, data):
                     continue
                 if before is None:
                     folder.unlink(name)
@@ -111,6 +130,13 @@ class Changes:
                 log("a change that was not made is still on the disk", logging.ERROR,
                     file=str(folder.path / name), reason=str(error))  # fmt: skip
         self.done()
+
+
+def _is_still(folder: Directory, name: str, data: bytes | None) -> bool:
+    """Whether a file holds `data`, or (None) is not there; FileNotFoundError where it has gone."""
+    if data is None:
+        return folder.stat(name) is None
+    return folder.read(name, max(LARGEST, len(data))) == data
 
 
 def _second_name(folder: Directory, name: str, second: str) -> bool:

@@ -11,9 +11,10 @@ from __future__ import annotations
 import asyncio
 import logging
 import secrets
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from flexdt.protocol.rpc_errors import RpcError, busy
@@ -25,13 +26,15 @@ from flexdt.server.scans.job_retries import Retry, transient
 from flexdt.server.scans.runner import JobAborted, Produce, ScanRunner
 from flexdt.server.scans.scan_job import ENDED, Job, JobInputs, Prepare, recalled
 from flexdt.server.scans.twin_clock import SpeedUp, TwinClock
-from flexdt.server.storage.memory import JobMemory
+from flexdt.server.storage.job_files import JobMemory, number_of
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.scanner.scanner import ScannerTwin
+from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script import Exposure, ScanPlan
 
 PUBLISH_INTERVAL_S = 0.1
-KEPT_JOBS = 200
+NAMED = 20
+"""Jobs that an error lists, the newest."""
 
 
 class Jobs:
@@ -43,6 +46,9 @@ class Jobs:
         max_waiting: jobs in the queue at a time.
         projectors: that make frames at the same time.
         root: the data directory, from which errors tell where files are.
+        max_ended: ended jobs that are known; beyond them the oldest is forgotten.
+        max_age: of an ended job that is known.
+        today: the date.
     """
 
     def __init__(
@@ -54,11 +60,17 @@ class Jobs:
         max_waiting: int = 1000,
         projectors: int = 1,
         root: Path | None = None,
+        max_ended: int = 1000,
+        max_age: timedelta = timedelta(days=365),
+        today: Callable[[], datetime] = lambda: datetime.now(UTC),
     ) -> None:
         self._root = root
+        self._max_ended, self._max_age, self._today = max_ended, max_age, today
         self._projectors = projectors
         self._scanner, self._clock, self._notify = scanner, clock, changed
         self._all: dict[str, Job] = {}
+        self._changed: set[str] = set()
+        """Jobs that have changed, or are forgotten, since `changed` was called last."""
         self._queue: asyncio.Queue[Job] = asyncio.Queue()
         self._count = 0
         self.current: Job | None = None
@@ -90,8 +102,11 @@ class Jobs:
             return next(reversed(self._all.values()))
         if job is None or job not in self._all:
             asked = "" if job is None else f"no job {job!r}; "
-            there = f"there are: {', '.join(self._all)}" if self._all else "there are no jobs yet"
-            raise UnknownNameError(asked + there, {"asked": job, "allowed": list(self._all)})
+            last = list(self._all)[-NAMED:]
+            older = len(self._all) - len(last)
+            more = f"{older} older ones and " if older else ""
+            there = f"there are: {more}{', '.join(last)}" if last else "there are no jobs yet"
+            raise UnknownNameError(asked + there, {"asked": job, "allowed": last})
         return self._all[job]
 
     @property
@@ -147,6 +162,21 @@ class Jobs:
         """Whether a job that has not ended writes into `folder`."""
         return any(j.folder == folder and j.phase not in ENDED for j in self._all.values())
 
+    def showing(self, sample: str) -> Job | None:
+        """A job that has not ended and shows the sample of that name."""
+        unended = (j for j in self._all.values() if j.phase not in ENDED)
+        return next((j for j in unended if j.sample is not None and j.sample.name == sample), None)
+
+    def shows(self, sample: Sample) -> None:
+        """The current job shows this sample."""
+        if self.current is not None:
+            self.current.sample = sample
+
+    def samples(self) -> list[Sample]:
+        """What the jobs that have not ended show."""
+        unended = (j for j in self._all.values() if j.phase not in ENDED)
+        return [j.sample for j in unended if j.sample is not None]
+
     def status(self, job: Job) -> JobStatus:
         """A job as the wire has it."""
         p = job.where
@@ -182,6 +212,7 @@ class Jobs:
         speed_up: SpeedUp | None = None,
         warnings: list[str] | None = None,
         job: Job | None = None,
+        sample: Sample | None = None,
     ) -> Job:
         """The next job, or one that has ended as it will be; nobody knows it until `enqueue`.
 
@@ -189,6 +220,7 @@ class Jobs:
             name, folder: of the data set.
             plan, prepare, speed_up, warnings: of the scan.
             job: that goes on; None for a new one.
+            sample: that it shows.
 
         Raises:
             RpcError: -32003, too many wait already, or it has not ended.
@@ -201,8 +233,8 @@ class Jobs:
             raise self._cannot("resume", job, ENDED)
         return replace(
             job or Job(f"job-{self._count + 1}", name, folder), prepare=prepare, phase="queued",
-            error=None, speed_up=speed_up, frames_total=plan.frames, duration_s=plan.duration_s,
-            warnings=warnings or [],
+            error=None, ended=None, speed_up=speed_up, frames_total=plan.frames,
+            duration_s=plan.duration_s, warnings=warnings or [], sample=sample,
         )  # fmt: skip
 
     def enqueue(self, draft: Job) -> Job:
@@ -210,10 +242,9 @@ class Jobs:
         self._count += draft.id not in self._all
         job = self._all.setdefault(draft.id, draft)
         vars(job).update(vars(draft))
-        for old in [j for j in self._all.values() if j.phase in ENDED][:-KEPT_JOBS]:
-            del self._all[old.id]
+        self._forget_old()
         self._queue.put_nowait(job)
-        self._notify(job)
+        self._tell(job)
         return job
 
     def pause(self, job: Job) -> None:
@@ -225,7 +256,7 @@ class Jobs:
         runner = self._runner(job, "pause", ("running", "paused"))
         self._take_over()
         runner.pause()
-        self._notify(job)
+        self._tell(job)
 
     def resume(self, job: Job) -> None:
         """Let a paused job go on; nothing to do for one that runs."""
@@ -245,8 +276,8 @@ class Jobs:
         if job.runner is not None and job.phase not in ENDED:
             job.runner.abort(reason)
         elif job.phase == "queued":
-            job.phase, job.aborted_for = "aborted", reason
-            self._notify(job)
+            job.phase, job.aborted_for, job.ended = "aborted", reason, self._today()
+            self._tell(job)
 
     def interrupt(self, reason: Exception) -> None:
         """Motion was stopped from outside (stop, E-stop): pause what runs or is about to."""
@@ -261,21 +292,73 @@ class Jobs:
         self.retry.cancel()
         self._by_hand = True
 
-    # Remembering --------------------------------------------------------------------------------
+    # Remembering and forgetting -----------------------------------------------------------------
 
-    def memory(self) -> tuple[list[JobMemory], int]:
-        """All jobs for the next server, and how many were ever made."""
-        return [job.memory() for job in self._all.values()], self._count
+    @property
+    def made(self) -> int:
+        """Jobs there ever were."""
+        return self._count
+
+    def changed(self) -> dict[str, JobMemory | None]:
+        """Jobs that have changed since the last call; None for one that is forgotten."""
+        names, self._changed = self._changed, set()
+        known = {name: self._all.get(name) for name in sorted(names, key=number_of)}
+        return {name: None if job is None else job.memory() for name, job in known.items()}
 
     def recall(self, jobs: Sequence[JobMemory], made: int, root: Directory) -> list[Job]:
         """Know the jobs of the server before this one; returns those that it left undone."""
-        self._count = max(self._count, made)
+        self._count = max(self._count, made, *(number_of(memory.id) for memory in jobs))
         left = []
         for memory in jobs:
-            job = self._all[memory.id] = recalled(memory, root)
+            job = self._all[memory.id] = recalled(memory, root, self._today())
             if memory.phase not in ENDED:
                 left.append(job)
+            if job.memory() != memory:
+                self._changed.add(job.id)
+        self._forget_old()
         return left
+
+    def ended(self, job: str | None, min_age: timedelta) -> list[Job]:
+        """The ended jobs that were asked for, to be forgotten.
+
+        Args:
+            job: its name; None for all of at least an age.
+            min_age: since they ended; of a job that is named it does not matter.
+
+        Raises:
+            UnknownNameError: there is no such job.
+            RpcError: -32003, it has not ended.
+        """
+        if job is None:
+            return self._older(self._today() - min_age)
+        found = self.get(job)
+        if found.phase not in ENDED or found is self.current:
+            raise self._cannot("forget", found, ENDED)
+        return [found]
+
+    def forget(self, jobs: Iterable[Job]) -> None:
+        """Know these jobs no longer; their data sets stay."""
+        for job in jobs:
+            if self._all.get(job.id) is job:
+                del self._all[job.id]
+                self._changed.add(job.id)
+
+    def _forget_old(self) -> None:
+        """Forget the ended jobs beyond those that are kept, and those that are too old."""
+        ended = [j for j in self._all.values() if j.phase in ENDED and j is not self.current]
+        self.forget(ended[: max(0, len(ended) - self._max_ended)])
+        self.forget(self._older(self._today() - self._max_age))
+
+    def _older(self, than: datetime) -> list[Job]:
+        return [
+            job
+            for job in self._all.values()
+            if job.phase in ENDED and job is not self.current and (job.ended or than) <= than
+        ]
+
+    def _tell(self, job: Job) -> None:
+        self._changed.add(job.id)
+        self._notify(job)
 
     # Running ------------------------------------------------------------------------------------
 
@@ -295,7 +378,7 @@ class Jobs:
             except Exception as error:  # whatever it is, it is this job's, and the next one runs
                 phase = self._failed(job, error)
             finally:
-                job.phase = phase
+                job.phase, job.ended = phase, self._today()
                 self.retry.cancel()
                 self.current = None
                 # The plan of a long scan is large, and ended jobs are kept for a while.
@@ -303,7 +386,8 @@ class Jobs:
                 job.runner = job.prepare = None
                 if self._clock.speed_up == wanted:
                     self._clock.set_speed_up(before)
-                self._notify(job)
+                self._forget_old()
+                self._tell(job)
 
     async def _run(self, job: Job) -> JobPhase:
         """Run one job to its end, whatever that is."""
@@ -326,9 +410,10 @@ class Jobs:
             job.frames_seen = job.runner.progress.frames_done
             if (stopped := self._stopped()) is not None:
                 job.runner.pause(stopped)
-            self._notify(job)
+            self._tell(job)
             await job.runner.run()
             await asyncio.to_thread(scan.store.finish, duration_s=scan.plan.duration_s)
+            await asyncio.to_thread(scan.finished)
         except JobAborted as ended:
             await asyncio.to_thread(self._mark, job, scan, str(ended))
             return "aborted"
@@ -408,7 +493,7 @@ class Jobs:
         now = asyncio.get_running_loop().time()
         if important or now - job.published_at >= PUBLISH_INTERVAL_S:
             job.published_at = now
-            self._notify(job)
+            self._tell(job)
 
     def _go_on_later(self) -> None:
         """Try again what a full disk or a projector paused, unless somebody took over."""

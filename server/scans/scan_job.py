@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path
 from typing import get_args
 
@@ -14,8 +15,9 @@ from flexdt.runtime.files.directory import Directory
 from flexdt.server.scans.runner import Produce, Progress, ScanRunner
 from flexdt.server.scans.twin_clock import SpeedUp
 from flexdt.server.storage.dataset_writer import DatasetWriter
-from flexdt.server.storage.memory import JobMemory
+from flexdt.server.storage.job_files import JobMemory
 from flexdt.twin.dataset.dataset_errors import DatasetError
+from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script import ScanPlan
 
 ENDED: tuple[JobPhase, ...] = get_args(EndedPhase)
@@ -28,6 +30,8 @@ class JobInputs:
     plan: ScanPlan
     store: DatasetWriter
     produce: Produce
+    finished: Callable[[], None] = lambda: None
+    """Called in a thread once the data set is complete."""
 
 
 Prepare = Callable[[], Awaitable[JobInputs]]
@@ -41,6 +45,8 @@ class Job:
     name: str
     folder: str
     prepare: Prepare | None = None
+    sample: Sample | None = None
+    """What it shows, as far as that is known before its turn."""
     frames_total: int = 0
     duration_s: float = 0.0
     speed_up: SpeedUp | None = None
@@ -52,6 +58,8 @@ class Job:
     last: Progress | None = None
     published_at: float = 0.0
     frames_seen: int = 0
+    ended: datetime | None = None
+    """When it ended, by the server's calendar."""
     logged: str = ""
     """The state that the topic `log` was last told."""
 
@@ -76,15 +84,22 @@ class Job:
         return JobMemory(**known | {"folder": Path(self.folder).name})
 
 
-def recalled(memory: JobMemory, root: Directory) -> Job:
-    """A job of the server before this one; one that was not ended is incomplete and says so."""
+def recalled(memory: JobMemory, root: Directory, now: datetime) -> Job:
+    """A job of the server before this one; one that was not ended is incomplete and says so.
+
+    Args:
+        memory: as it was.
+        root: the data directory.
+        now: taken for its end where that is not known.
+    """
     folder = root.folder(memory.folder)
     known = memory.model_dump(exclude={"folder", "elapsed_s", "frames_done"})
     last = Progress("done", memory.elapsed_s, memory.frames_done)
     job = Job(folder=str(folder.path), last=last, **known)
+    job.ended = job.ended or now
     if job.phase in ENDED:
         return job
-    if _complete(folder):  # it was killed between the last file and telling of it
+    if is_complete(folder):  # it was killed between the last file and telling of it
         job.phase, job.error = "done", None
         job.last = Progress("done", memory.duration_s, memory.frames_total)
         return job
@@ -99,7 +114,7 @@ def recalled(memory: JobMemory, root: Directory) -> Job:
     return job
 
 
-def _complete(folder: Directory) -> bool:
+def is_complete(folder: Directory) -> bool:
     """Whether a data set lies there that says that it is complete."""
     try:
         return read_document(folder).complete

@@ -1,7 +1,8 @@
 """What a scan was asked to be and what it started from, kept in DATA/jobs so that it can go on.
 
-One JSON file a data set: the wish (script byte for byte, or poses), the scanner's state at the
-start, sample, seed, pace. With it any later server makes exactly the missing images.
+One JSON file a data set that is not complete: the wish (script byte for byte, or poses), the
+scanner's state at the start, sample, seed, pace. With it any later server makes exactly the missing
+images.
 
 Poses of a trajectory are kept as text: 200 000 of them are two strings and no million objects.
 """
@@ -10,6 +11,7 @@ from __future__ import annotations
 
 import base64
 import json
+import logging
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Annotated, Any, Final
@@ -18,14 +20,17 @@ from pydantic import Field, TypeAdapter
 
 from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.files.own_documents import Changes, file_stem, read_json, read_or_set_aside
+from flexdt.runtime.log import log
 from flexdt.server.scans.twin_clock import SpeedUp, check_speed_up
+from flexdt.server.storage.job_files import RECORDS
+from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 from flexdt.twin.physics.predicted_beam import Physics
 from flexdt.twin.physics.scatter import Scatter
 from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script import StartState
 
 Poses = list[dict[str, float]]
-FOLDER = "jobs"
+FOLDER = RECORDS
 SCHEMA = 2
 MAX_MOMENTS = 64
 _EXPOSURE: TypeAdapter[float | None] = TypeAdapter(float | None)
@@ -155,6 +160,18 @@ class JobRecord:
             "operator": self.operator,
         }
         changes.put_json(root.folder(FOLDER), f"{file_stem(name)}.json", document)
+
+    @staticmethod
+    def remove(root: Directory, name: str) -> None:
+        """Delete the one of a data set that is complete: nothing goes on from it; errors are logged
+
+        A file that stays is harmless.
+        """
+        try:
+            root.folder(FOLDER).discard(f"{file_stem(name)}.json")
+        except DatasetWriteError as error:
+            log("the record of a complete scan was not deleted", logging.WARNING,
+                reason=str(error))  # fmt: skip
 
     @classmethod
     def read(cls, root: Directory, name: str) -> JobRecord:

@@ -21,17 +21,18 @@ from flexdt.protocol.messages import Encoded
 from flexdt.protocol.rpc_errors import RpcError, busy, invalid_params, problem
 from flexdt.runtime.files.dataset_folder import dated_name, read_document
 from flexdt.runtime.files.directory import Directory, free_bytes
-from flexdt.runtime.files.own_documents import used_bytes
+from flexdt.runtime.files.own_documents import Changes, used_bytes
 from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.scans.acquisition import Acquisition, FrameListener
 from flexdt.server.scans.checking import CheckInput, Checks
 from flexdt.server.scans.jobs import Jobs
-from flexdt.server.scans.scan_job import Job, JobInputs, Prepare
+from flexdt.server.scans.scan_job import Job, JobInputs, Prepare, is_complete
 from flexdt.server.scans.scan_record import FOLDER, JobRecord, ScanSource, StartConditions
 from flexdt.server.scans.stage import Stage
 from flexdt.server.scans.twin_clock import SpeedUp
 from flexdt.server.storage.dataset_writer import RESERVE_BYTES, DatasetWriter
-from flexdt.server.storage.memory import Memory, StateStore, with_job
+from flexdt.server.storage.job_files import JobFiles, number_of
+from flexdt.server.storage.memory import Memory, StateStore
 from flexdt.twin.dataset import dataset_errors as ds
 from flexdt.twin.dataset.file_names import DOCUMENT, SCAN_SETTINGS, SCRIPT, XRE_SETTINGS, plain_name
 from flexdt.twin.dataset.flexdt_json import NoiseRecord, SampleRecord, ScanRecord
@@ -53,6 +54,7 @@ class Submissions:
         radiography: how images are made.
         root: the data directory.
         keeper: writes a job down before it is in the queue.
+        job_files: where it is written.
         now: the date.
         shown: told of images for watchers.
         seed: makes the noise's seed of a new scan; None for scans without noise.
@@ -67,6 +69,7 @@ class Submissions:
     stage: Stage
     root: Directory
     keeper: StateStore
+    job_files: JobFiles
     now: Callable[[], datetime]
     shown: FrameListener
     seed: Callable[[], int | None]
@@ -123,7 +126,9 @@ class Submissions:
         folder = str(self.root.path / chosen)
         return await self._queued(
             sidecar, chosen, ensure_allowed,
-            lambda: self.jobs.draft(chosen, folder, plan, prepare, speed_up, warnings),
+            lambda: self.jobs.draft(
+                chosen, folder, plan, prepare, speed_up, warnings, sample=begin.sample
+            ),
         )  # fmt: skip
 
     async def again(self, job: Job, ensure_allowed: Callable[[], None] = lambda: None) -> None:
@@ -148,7 +153,8 @@ class Submissions:
         await self._queued(
             sidecar, name, ensure_allowed,
             lambda: self.jobs.draft(
-                name, job.folder, plan, prepare, sidecar.speed_up, warnings, job
+                name, job.folder, plan, prepare, sidecar.speed_up, warnings, job,
+                sidecar.begin.sample,
             ),
         )  # fmt: skip
 
@@ -168,7 +174,12 @@ class Submissions:
 
         def after(memory: Memory) -> Memory:
             drafts.append(make())
-            return with_job(memory, drafts[0].memory())
+            made = max(memory.jobs_made, number_of(drafts[0].id))
+            return memory.model_copy(update={"jobs_made": made})
+
+        def files(changes: Changes) -> None:
+            asked.keep(changes, self.root, name)
+            self.job_files.put(changes, drafts[0].memory())
 
         def take() -> Job:
             ensure_allowed()
@@ -177,9 +188,7 @@ class Submissions:
                 raise name_conflict(name, "a job is writing it")
             return self.jobs.enqueue(draft)
 
-        return await self.keeper.keep(
-            take, after, lambda changes: asked.keep(changes, self.root, name)
-        )
+        return await self.keeper.keep(take, after, files)
 
     async def _ready(
         self, asked: JobRecord, name: str, resume: bool, ensure_allowed: Callable[[], None]
@@ -204,6 +213,7 @@ class Submissions:
             if not resume:  # others may have moved since, and put something else on the stage
                 begin = replace(asked.begin, start=self.start(), sample=self.scanner.sample)
                 begun = replace(asked, begin=begin)
+                self.jobs.shows(begin.sample)
             # The sample's file and the correction may be others by now; then it is checked anew.
             final = await self.checks.sound(
                 await self._matter(begun.wish, begun.begin.start, begun.begin.sample)
@@ -273,7 +283,8 @@ class Submissions:
             plan, radiography, begin.sample, begin.seed, writer.put, begin.moments, self.shown,
             lambda: self._ensure_same(begin),
         )  # fmt: skip
-        return JobInputs(plan, writer, acquisition.produce)
+        finished = partial(JobRecord.remove, self.root, name)
+        return JobInputs(plan, writer, acquisition.produce, finished)
 
     def _ensure_same(self, begin: StartConditions) -> None:
         """Check that a scan's sample, which has been read, is what it was when the scan began.
@@ -320,6 +331,8 @@ class Submissions:
             }:
                 complete = read_document(folder).complete
         except FileNotFoundError:
+            if is_complete(folder):
+                raise refused("that data set is complete") from None
             raise refused("there is something that no scan of this twin has begun") from None
         except (OSError, ds.DatasetError, ValueError, KeyError, TypeError) as error:
             raise refused(f"it holds something that cannot be resumed ({error})") from None

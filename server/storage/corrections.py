@@ -20,7 +20,7 @@ from flexdt.protocol.rpc_errors import invalid_params, problem
 from flexdt.runtime.files import own_documents as own
 from flexdt.runtime.files.directory import Directory
 from flexdt.server.storage.scene_document import correction_fields, correction_of
-from flexdt.twin.errors import UnknownNameError
+from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.geometry.offsets import Offsets, require_plausible
 from flexdt.twin.scanner.state import NamedCorrection
 
@@ -45,15 +45,20 @@ class Corrections:
         history: names in the order in which they were put in force.
     """
 
-    def __init__(self, folder: Directory, history: Sequence[str | None] = ()) -> None:
-        self._folder = folder
+    def __init__(
+        self, folder: Directory, history: Sequence[str | None] = (), most: int = 10_000
+    ) -> None:
+        self._folder, self._most = folder, most
         self._all: dict[str, NamedCorrection] = {}
         self._sources: dict[str, str | None] = {}
+        self._files: dict[str, str] = {}
+        """Name of a correction -> its file."""
         for file in own.ours(folder):
             without = "a correction cannot be read; without it"
             found = own.read_or_set_aside(folder, file, _read, without)
             if found is not None:
                 self.know(*found)
+                self._files.setdefault(found[0].name, file)
         known = list(history)
         self.lost: str | None = None
         """The correction that was in force and is not there any more."""
@@ -100,6 +105,7 @@ class Corrections:
         Raises:
             UnknownNameError: a name that is not a parameter.
             RpcError: -32602, the name is taken; corrections are never edited.
+            LimitError: there are as many as may be.
         """
         date = (when or datetime.now(UTC)).isoformat(timespec="milliseconds")
         parameters = Offsets.from_edge(values)
@@ -109,6 +115,12 @@ class Corrections:
                 f"a correction called {chosen!r} exists and corrections are never edited",
                 [problem("name", "taken", chosen)],
                 "another name",
+            )
+        if chosen not in self._all and len(self._all) >= self._most:
+            raise LimitError(
+                f"there are {len(self._all)} corrections, {self._most} allowed; "
+                "calibration.delete makes room",
+                {"asked": len(self._all) + 1, "allowed": self._most},
             )
         return self._all.get(chosen) or NamedCorrection(chosen, date, parameters, note)
 
@@ -128,8 +140,7 @@ class Corrections:
         if correction.name in self._all:
             return
         document = CorrectionFile(schema=1, source=source, **correction_fields(correction))
-        stamp = correction.date.split(".")[0].replace(":", "")
-        name = f"{stamp} {own.file_stem(correction.name)}.json"
+        name = _file(correction)
         changes.put_json(self._folder, name, document.model_dump(by_alias=True))
 
     def know(self, correction: NamedCorrection, source: str | None) -> None:
@@ -138,12 +149,43 @@ class Corrections:
             self._all[correction.name] = correction
             self._sources[correction.name] = source
 
+    def without(self, name: str) -> History:
+        """The history once the correction called `name` is deleted.
+
+        Raises:
+            UnknownNameError: there is no such correction.
+            LimitError: it is in force.
+        """
+        correction = self.get(name)
+        if correction is self.in_force:
+            raise LimitError(
+                f"the correction {name!r} is in force and cannot be deleted",
+                {"asked": name, "allowed": "calibration.apply or calibration.revert first"},
+            )
+        return [known for known in self.history if known != name]
+
+    def remove(self, changes: own.Changes, name: str) -> None:
+        """Delete a correction's file, among other changes."""
+        changes.remove(self._folder, self._files.get(name) or _file(self._all[name]))
+
+    def forget(self, name: str, history: History) -> None:
+        """Know a correction no longer; `history` is without it."""
+        del self._all[name]
+        self._sources.pop(name, None)
+        self._files.pop(name, None)
+        self.history = history
+
     def _free_name(self, date: str) -> str:
         base = f"correction-{date[:10]}"
         taken = sum(name.startswith(base) for name in self._all)
         while (name := f"{base}-{taken + 1}") in self._all:
             taken += 1
         return name
+
+
+def _file(correction: NamedCorrection) -> str:
+    stamp = correction.date.split(".")[0].replace(":", "")
+    return f"{stamp} {own.file_stem(correction.name)}.json"
 
 
 def _read(data: bytes) -> tuple[NamedCorrection, str | None]:

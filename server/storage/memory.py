@@ -1,8 +1,9 @@
 """The state that a twin server restores after it was killed: DATA/state.json.
 
-Positions, settings, tube, camera, sample, an E-stop in force, the list of jobs and the corrections
-in force are one document, so that a change of several of them is written whole or not at all. A
-client's change that must survive is written first and takes effect afterwards (see
+Positions, settings, tube, camera, sample, an E-stop in force and the corrections in force are one
+document, so that a change of several of them is written whole or not at all. It does not grow with
+what was ever made: jobs have files of their own (`job_files`), of which those that have changed are
+written. A client's change that must survive is written first and takes effect afterwards (see
 `StateStore.keep`): if it cannot be written, nothing has changed. Positions and the progress of a
 scan are written as they change, at most a few times a second, and when the server stops. An E-stop
 waits for no disk, but it is written at once, whatever was written a moment ago or failed. After a
@@ -15,24 +16,21 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
-from typing import Annotated, Literal, TypeVar
+from typing import Literal, TypeVar
 
-from annotated_types import Ge, Le
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field
 
-from flexdt.protocol.fields import SpeedUp
 from flexdt.protocol.methods import document_messages as p
 from flexdt.protocol.rpc_errors import RpcError
-from flexdt.protocol.state_model import JobPhase
 from flexdt.runtime.files import own_documents as own
 from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.log import log
+from flexdt.server.storage.job_files import Count, JobFiles, JobMemory
 from flexdt.server.storage.scene_document import apply_settings, require_fit, sample_of, save_scene
 from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetWriteError
-from flexdt.twin.dataset.file_names import plain_name
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.scanner.scanner import ScannerTwin
@@ -41,11 +39,10 @@ from flexdt.twin.scanner.state import Sample
 FILE = "state.json"
 INTERVAL_S = 0.25
 """Real seconds between two writes, at least."""
+ChangedJobs = dict[str, JobMemory | None]
 FAR_S = 60.0
 """After a write that failed (a full disk), the next one waits so long [s]."""
 
-Seconds = Annotated[float, Ge(0), Le(1e12)]
-Count = Annotated[int, Ge(0), Le(2**53)]
 T = TypeVar("T")
 
 
@@ -55,26 +52,12 @@ class _Part(BaseModel):
     )
 
 
-class JobMemory(_Part):
-    """One job as it was."""
-
-    id: str
-    name: str
-    folder: Annotated[str, AfterValidator(plain_name)]
-    phase: JobPhase
-    frames_total: Count
-    frames_done: Count
-    duration_s: Seconds
-    elapsed_s: Seconds = 0.0
-    speed_up: SpeedUp | None = None
-    warnings: list[str] = Field(default_factory=list)
-    error: dict[str, object] | None = None
-
-
 class Memory(_Part):
     """The document.
 
     Attributes:
+        jobs: as earlier servers kept them; those that have no file yet.
+        jobs_made: jobs there ever were.
         corrections: names in the order in which they were put in force; None is nominal.
     """
 
@@ -91,13 +74,22 @@ class Memory(_Part):
 def remember(
     scanner: ScannerTwin,
     now: float,
-    jobs: list[JobMemory],
     made: int,
     corrections: list[str | None],
     *,
+    unfiled: Sequence[JobMemory] = (),
     ended: bool = False,
 ) -> Memory:
-    """The scanner at twin time `now`: where its motors are, not where they are bound."""
+    """The scanner at twin time `now`: where its motors are, not where they are bound.
+
+    Args:
+        scanner: as it is.
+        now: twin time [s].
+        made: jobs there ever were.
+        corrections: the history of corrections.
+        unfiled: jobs of an earlier server that could not be given files yet.
+        ended: whether the server has ended.
+    """
     scene = save_scene(scanner, now).model_copy(update={"positions": scanner.positions(now)})
     return Memory(
         schema=1,
@@ -105,7 +97,7 @@ def remember(
         ended=ended,
         scene=scene,
         estop=scanner.safety.state == "estopped",
-        jobs=jobs,
+        jobs=list(unfiled),
         jobs_made=made,
         corrections=corrections,
     )
@@ -124,14 +116,6 @@ def as_of(
     scene = save_scene(scanner, 0.0).model_copy(update={"positions": memory.scene.positions})
     names = memory.corrections if corrections is None else corrections
     return memory.model_copy(update={"scene": scene, "corrections": names})
-
-
-def with_job(memory: Memory, job: JobMemory) -> Memory:
-    """The document with one more job, or with one that has changed."""
-    jobs = {known.id: known for known in memory.jobs}
-    made = memory.jobs_made + (job.id not in jobs)
-    jobs[job.id] = job
-    return memory.model_copy(update={"jobs": list(jobs.values()), "jobs_made": made})
 
 
 def read_memory(root: Directory) -> Memory | None:
@@ -171,16 +155,31 @@ def restore(memory: Memory, scanner: ScannerTwin, now: float) -> Sample | None:
     return None if known is None else sample_of(known)
 
 
+class JobsNotWrittenError(DatasetWriteError):
+    """The state has been written, but not each job that has changed."""
+
+
 class StateStore:
     """Writes the memory while the server runs.
 
     Args:
         root: the data directory.
         make: makes the document.
+        job_files: where jobs are written.
+        changed_jobs: takes the jobs that have changed since it was called last, None for one that
+            is forgotten.
     """
 
-    def __init__(self, root: Directory, make: Callable[[bool], Memory]) -> None:
+    def __init__(
+        self,
+        root: Directory,
+        make: Callable[[bool], Memory],
+        job_files: JobFiles,
+        changed_jobs: Callable[[], ChangedJobs],
+    ) -> None:
         self._root, self._make = root, make
+        self._job_files, self._changed_jobs = job_files, changed_jobs
+        self._unwritten: ChangedJobs = {}
         self._changed, self._at_once = asyncio.Event(), asyncio.Event()
         self._writing = asyncio.Lock()
         self._file = threading.Lock()
@@ -202,6 +201,9 @@ class StateStore:
             pause = INTERVAL_S
             try:
                 await self.flush()
+            except JobsNotWrittenError as error:
+                log("jobs were not written", logging.ERROR, reason=str(error))
+                asyncio.get_running_loop().call_later(FAR_S, self._changed.set)
             except (OSError, DatasetError) as error:
                 log("the state was not written", logging.ERROR, reason=str(error))
                 self._changed.set()  # the change is still pending
@@ -218,7 +220,7 @@ class StateStore:
             DatasetWriteError: the system cannot write.
         """
         async with self._writing:
-            await asyncio.to_thread(self._put, self._make(False))
+            await asyncio.to_thread(self._put, self._make(False), self._unwritten_jobs())
 
     async def keep(
         self,
@@ -263,17 +265,40 @@ class StateStore:
     def end(self) -> None:
         """Write for the last time; a write that is still on its way does not undo it."""
         try:
-            self._put(self._make(True))
+            self._put(self._make(True), self._unwritten_jobs())
         except (OSError, DatasetError) as error:
             log("the state was not written", logging.ERROR, reason=str(error))
 
-    def _put(self, memory: Memory) -> None:
+    def owe(self, jobs: Sequence[JobMemory]) -> None:
+        """Write these jobs with the next change."""
+        self._unwritten |= {job.id: job for job in jobs}
+
+    def is_unwritten(self, job: str) -> bool:
+        """Whether a change of a job is still to be written."""
+        return job in self._unwritten
+
+    def _unwritten_jobs(self) -> ChangedJobs:
+        """Jobs to write: those that have changed, and those that could not be written before."""
+        self._unwritten |= self._changed_jobs()
+        return dict(self._unwritten)
+
+    def _put(self, memory: Memory, jobs: ChangedJobs) -> None:
         # Ending cancels the task that waits for a worker thread, but not the thread.
         with self._file:
             if self._ended and not memory.ended:
                 return
             self._ended = memory.ended
-            self._root.keep(FILE, memory.model_dump_json(by_alias=True).encode("utf-8"))
+            self._root.keep(FILE, _text(memory))
+            for name, job in jobs.items():
+                self._put_job(name, job)
+
+    def _put_job(self, name: str, job: JobMemory | None) -> None:
+        try:
+            self._job_files.write(name, job)
+        except DatasetWriteError as error:
+            raise JobsNotWrittenError(error.message, error.data) from None
+        if self._unwritten.get(name, ...) == job:
+            del self._unwritten[name]
 
     def _put_all(
         self,
@@ -287,12 +312,16 @@ class StateStore:
             if files is not None:
                 files(changes)
             if document is not None:
-                text = document.model_dump_json(by_alias=True).encode("utf-8")
-                changes.put(self._root, FILE, text)
+                changes.put(self._root, FILE, _text(document))
 
     def _undo(self, changes: own.Changes) -> None:
         with self._file:
             changes.undo()
+
+
+def _text(memory: Memory) -> bytes:
+    without = set() if memory.jobs else {"jobs"}
+    return memory.model_dump_json(by_alias=True, exclude=without).encode("utf-8")
 
 
 def _within(machine: Machine, positions: Mapping[str, float]) -> dict[str, float]:

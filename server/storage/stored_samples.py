@@ -70,10 +70,13 @@ class SampleStore:
     Args:
         folder: where uploads are kept.
         limit: largest upload [bytes].
+        most: uploads there may be.
     """
 
-    def __init__(self, folder: Directory, limit: int = MAX_UPLOAD_BYTES) -> None:
-        self._folder, self._limit = folder, limit
+    def __init__(
+        self, folder: Directory, limit: int = MAX_UPLOAD_BYTES, most: int = 10_000
+    ) -> None:
+        self._folder, self._limit, self._most = folder, limit, most
         self._incoming: Incoming = Incoming(folder, 2 * limit)
         self._heads: dict[str, UploadHead] = {}
         """Their revisions are what their files say; those of older servers say nothing."""
@@ -91,7 +94,9 @@ class SampleStore:
         """Guards the tables: samples are loaded by worker threads and by the event loop."""
         self.turn = asyncio.Lock()
         """Held while an upload is read, so that uploads never take all worker threads."""
-        self.tidy()
+        self._replaced: set[str] = set()
+        """Files of bytes that no upload has any more."""
+        self._settle()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -161,6 +166,12 @@ class SampleStore:
                 {"asked": head.name, "taken": [EMPTY, *phantoms.phantom_names()]},
             )
         own.file_stem(head.name)
+        if head.name not in self._heads and len(self._heads) >= self._most:
+            raise LimitError(
+                f"there are {len(self._heads)} uploads, {self._most} allowed; sample.delete makes "
+                "room",
+                {"asked": len(self._heads) + 1, "allowed": self._most},
+            )
         return self._incoming.receive(head, start, data)
 
     def parse(self, name: str, material: str | None = None) -> ReceivedSample:
@@ -193,19 +204,50 @@ class SampleStore:
     def know(self, upload: ReceivedSample) -> None:
         """Make a stored upload the current one of its name; `tidy` removes the previous one."""
         name = upload.head.name
+        new = upload.head.model_copy(update={"revision": upload.revision})
         with self._lock:
-            self._heads[name] = upload.head.model_copy(update={"revision": upload.revision})
-            for key in [k for k in self._loaded if k[0] == name]:
-                del self._loaded[key]
+            self._replace(name, new)
             self._keep((name, None), upload.phantom, upload.revision)
             if upload.worn is not None:
                 self._keep((name, upload.worn[0]), upload.worn[1], upload.revision)
 
-    def tidy(self) -> None:
-        """Delete bytes that no upload has any more, and what killed writers left behind."""
-        self._folder.sweep([TEMPORARY])  # what a change replaces may be needed yet
+    def remove(self, changes: own.Changes, name: str) -> None:
+        """Delete what says that there is an upload; `tidy` removes its bytes after `forget`.
+
+        Raises:
+            DatasetWriteError: the system refuses.
+        """
+        changes.remove(self._folder, f"{own.file_stem(name)}.json")
+
+    def forget(self, name: str) -> None:
+        """Know an upload no longer."""
         with self._lock:
-            known = {_bytes_file(name, head.revision) for name, head in self._heads.items()}
+            self._replace(name, None)
+
+    def _replace(self, name: str, new: UploadHead | None) -> None:
+        """Know another upload under a name, or none; with the lock held."""
+        old = self._heads.pop(name, None)
+        if old is not None:
+            self._replaced.add(_bytes_file(name, old.revision))
+        if new is not None:
+            self._heads[name] = new
+            self._replaced.discard(_bytes_file(name, new.revision))
+        self._revisions.pop(name, None)
+        for key in [k for k in self._loaded if k[0] == name]:
+            del self._loaded[key]
+
+    def tidy(self) -> None:
+        """Delete the bytes that an upload or `forget` has replaced."""
+        with self._lock:
+            files, self._replaced = self._replaced, set()
+        for file in files:
+            with suppress(OSError):
+                self._folder.unlink(file)
+
+    def _settle(self) -> None:
+        """At the start: delete bytes that no upload has, and what killed writers left behind."""
+        self._folder.sweep([TEMPORARY])
+        known = {_bytes_file(name, head.revision) for name, head in self._heads.items()}
         there = self._folder.names()
         for file in fnmatch.filter(there, f"*.{'?' * 16}.bin"):
             damaged = f"{file.split('.')[0]}{own.ASIDE}.json" in there

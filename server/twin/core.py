@@ -15,7 +15,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Coroutine
 from dataclasses import asdict, replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from importlib.metadata import version
 from typing import Any
 
@@ -34,6 +34,7 @@ from flexdt.server.scans.submission import RESERVED, Submissions
 from flexdt.server.scans.twin_clock import SpeedUp, TwinClock
 from flexdt.server.storage import corrections
 from flexdt.server.storage import memory as kept
+from flexdt.server.storage.job_files import JobFiles, JobMemory, number_of
 from flexdt.server.storage.past_scans import PastScans
 from flexdt.server.storage.stored_samples import ReceivedSample, SampleStore, sample_material
 from flexdt.server.twin import state_views
@@ -41,6 +42,7 @@ from flexdt.server.twin.hub import Hub
 from flexdt.server.twin.live import LiveView, Shot, StateFeed
 from flexdt.twin.collision.first_contact import NearestPair, clearance
 from flexdt.twin.collision.guard import SceneGuard
+from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 from flexdt.twin.errors import GeometryError, SafetyError
 from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.machine.description import Machine, Profile
@@ -174,14 +176,18 @@ class TwinServer:
         )
         self.control = ControlLease(self.limits.control_idle_s, wall)
         settle(root, RESERVED)
-        self.samples = SampleStore(root.folder("samples"), self.limits.max_upload)
+        self.samples = SampleStore(
+            root.folder("samples"), self.limits.max_upload, self.limits.max_samples
+        )
         self.samples.standing = lambda: (self.scanner.sample.name, self.scanner.sample.material)
         self.shapes = Shapes()
         self.past_scans = PastScans(self.root, machine, profile)
         self.predictors = predictors()
         self.remembered = kept.read_memory(root)
         known = [] if self.remembered is None else self.remembered.corrections
-        self.corrections = corrections.Corrections(root.folder("corrections"), known)
+        self.corrections = corrections.Corrections(
+            root.folder("corrections"), known, self.limits.max_corrections
+        )
         self._apply_last()
         self.stage_turn = asyncio.Lock()
         """Held while the stage is changed: such changes come one after the other."""
@@ -192,7 +198,8 @@ class TwinServer:
         )
         self.jobs = Jobs(
             self.scanner, self.clock, self._job_changed, max_waiting=self.limits.max_jobs,
-            projectors=projectors, root=self.root,
+            projectors=projectors, root=self.root, max_ended=self.limits.max_ended_jobs,
+            max_age=timedelta(days=self.limits.ended_job_days),
         )  # fmt: skip
         self.radiography = Radiography.of(self.imaging, machine, physics, scatter)
         self.live = LiveView(
@@ -201,7 +208,12 @@ class TwinServer:
         self.feed = StateFeed(
             self.scanner, self.clock, self.hub, self.state, lambda: self.jobs.running
         )
-        self.keeper = kept.StateStore(root, self._memory)
+        self.job_files = JobFiles(root)
+        self.job_files.settle()
+        self.keeper = kept.StateStore(root, self._memory, self.job_files, self.jobs.changed)
+        self._unfiled: list[JobMemory] = []
+        """Jobs that an earlier server kept in its state, as long as they have no files."""
+        self._recalled = False
         self.submissions = Submissions(
             self.scanner,
             self.jobs,
@@ -209,6 +221,7 @@ class TwinServer:
             self.stage,
             root,
             self.keeper,
+            self.job_files,
             now=lambda: datetime.now(UTC),
             shown=self._scan_image,
             seed=seed,
@@ -227,6 +240,8 @@ class TwinServer:
         guard = await self.guard(shown, correction)
         for warning in self.scanner.initialise_stage(shown, correction, guard, self.clock.now()):
             self.tell("warning", f"at the start {warning}; motion that brings them apart is free")
+        if not self._recalled:
+            await asyncio.to_thread(self.job_files.clear)
         self.changed()
         work: list[Callable[[], Coroutine[Any, Any, None]]] = [
             self.jobs.work,
@@ -255,9 +270,9 @@ class TwinServer:
         None where nothing is remembered, or nothing that fits this machine.
         """
         memory = self.remembered
+        left = self._recall_jobs(memory)
         if memory is None:
             return None
-        left = self.jobs.recall(memory.jobs, memory.jobs_made, self.directory)
         sample = kept.restore(memory, self.scanner, self.clock.now())
         if not memory.ended or left:
             names = [job.id for job in left]
@@ -268,6 +283,23 @@ class TwinServer:
                 saved=memory.saved, jobs_to_resume=names, estop=memory.estop,
             )  # fmt: skip
         return None if sample is None else self._readable(sample)
+
+    def _recall_jobs(self, memory: kept.Memory | None) -> list[Job]:
+        """Know the jobs of earlier servers; returns those that were left undone."""
+        self._recalled = True
+        jobs = self.job_files.read()
+        if memory is None:
+            return self.jobs.recall(jobs, 0, self.directory)
+        there = {job.id for job in jobs}
+        unfiled = [job for job in memory.jobs if job.id not in there]
+        try:
+            for job in unfiled:
+                self.job_files.write(job.id, job)
+        except DatasetWriteError:  # tried again with each change; until then the state has them
+            self._unfiled = unfiled
+            self.keeper.owe(unfiled)
+        known = sorted([*jobs, *unfiled], key=lambda job: number_of(job.id))
+        return self.jobs.recall(known, memory.jobs_made, self.directory)
 
     def _apply_last(self) -> None:
         """At the start: the correction that was in force is, unless it cannot be."""
@@ -386,9 +418,12 @@ class TwinServer:
         return self.scanner.rest_time(now) > now
 
     def _memory(self, ended: bool) -> kept.Memory:
-        jobs, made = self.jobs.memory()
         history = self.corrections.history
-        return kept.remember(self.scanner, self.clock.now(), jobs, made, history, ended=ended)
+        self._unfiled = [job for job in self._unfiled if self.keeper.is_unwritten(job.id)]
+        return kept.remember(
+            self.scanner, self.clock.now(), self.jobs.made, history,
+            unfiled=self._unfiled, ended=ended,
+        )  # fmt: skip
 
     async def guard(
         self,

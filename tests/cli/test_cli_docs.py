@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from typer.main import get_command
 
-from flexdt.clients.cli.command_tree import SECTIONS, build
+from flexdt.clients.cli.command_tree import GROUPS, SECTIONS, build
 from flexdt.clients.cli.settings_file import TABLES
 from flexdt.runtime.settings import parameters
 
@@ -38,7 +38,7 @@ def documented() -> set[str]:
         group = ""
         for code in re.findall(r"`([^`]+)`", cell):
             words = code.removeprefix("flexdt ").split()
-            if code.startswith("flexdt ") and words[0] in ("job", "machine", "phantom", "script"):
+            if code.startswith("flexdt ") and words[0] in GROUPS:
                 group = words.pop(0) + " "
             elif code.startswith("flexdt "):
                 group = ""

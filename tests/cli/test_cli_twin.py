@@ -198,6 +198,9 @@ def test_run_a_script_to_its_data_set(
     jobs = document("job", "list")["jobs"]
     assert jobs[-1]["job"] == last["job"]
     assert "done" in flexdt("job", "status", last["job"])[1]
+    assert document("job", "forget", last["job"])["jobs"] == [last["job"]]
+    flexdt("job", "forget", "all")
+    assert all(j["state"] in ("running", "paused") for j in document("job", "list")["jobs"])
 
 
 def test_detached_run_can_be_watched_and_aborted(

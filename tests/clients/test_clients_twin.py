@@ -137,6 +137,7 @@ def test_both_clients_do_every_method_of_the_wire(shell: Shell, tmp_path: Path) 
     assert told == [(len(CUBE), len(CUBE))]
     assert twin.upload_voxels(np.full((4, 5, 6), 0.02), 0.5, "grid").complete
     assert twin.set_sample(file="corner").sample.name == "corner"
+    assert twin.delete_sample("grid").bytes == 4 * 4 * 5 * 6
     assert len(twin.sample_mesh()) == 84 + 4 * 50  # a binary STL of four triangles
     assert twin.set_sample("normal-5", offset={"z": 1.0}).sample.offset.z == 1.0
     assert twin.set_axis("mag_obj", speed=20.0).speed == 20.0
@@ -193,12 +194,14 @@ def test_both_clients_do_every_method_of_the_wire(shell: Shell, tmp_path: Path) 
     assert twin.resume_job(long).job == long
     assert twin.abort_job(long).job == long
     wait_for(lambda: twin.job_status(long).state in methods.FINAL_STATES)
+    assert twin.forget_job(long).jobs == [long]
 
     name = f"mine-{twin.ping():.6f}"
     assert twin.apply_calibration({"dD_x": 0.1}, name, comment="a test").correction.name == name
     assert twin.calibration().parameters["dD_x"] == 0.1
     assert name in {c.name for c in twin.calibrations().corrections}
     twin.revert_calibration()
+    assert twin.delete_calibration(name).name == name
     for asked in (
         lambda: twin.fit_calibration(["gone"], "lego"),
         lambda: twin.fit_calibration(["gone"], "lego", markers=[(0, "0", 3.0, 4.0, None)]),

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from flexdt.clients.client.client import TwinClient
     from flexdt.protocol.state_model import JobStatus
 
+ALL: Final = "all"
+"""Names every job that has ended."""
 Job = Annotated[
     str | None, typer.Argument(metavar="JOB", help="As in `job list`; the current one if left out.")
 ]
@@ -147,6 +149,17 @@ def _on_job(does: str, method: str) -> Callable[..., Answer]:
     return command
 
 
+def forget(
+    twin: Twin,
+    job: str = typer.Argument(metavar="JOB", help="As in `job list`; `all` that have ended."),
+) -> Answer:
+    """Forget an ended job; its data set stays."""
+    with twin() as client:
+        gone = client.forget_job(days=0.0) if job == ALL else client.forget_job(job)
+    yield gone
+    yield f"forgotten: {', '.join(gone.jobs) or 'none'}"
+
+
 def describe(status: JobStatus) -> str:
     """A job in one line."""
     text = f"{status.job}: {status.state}, {status.frames_done} of {status.frames_total} frames"
@@ -170,5 +183,6 @@ JOB_COMMANDS: Final = {
     "resume": _on_job("Return to the pose of the pause and go on.", "resume_job"),
     "step": _on_job("Run a paused job for one step.", "step_job"),
     "abort": _on_job("End a job; its data set stays, marked incomplete.", "abort_job"),
+    "forget": forget,
 }
 """Commands of the group by name."""

@@ -314,6 +314,30 @@ def sample(
     yield f"on the stage: {now.sample.name or 'nothing'}"
 
 
+def delete_sample(twin: Twin, name: str = argument(..., "NAME")) -> Answer:
+    """Delete an uploaded sample from the twin.
+
+    Args:
+        name: As `flexdt sample` lists it.
+    """
+    with twin() as client:
+        gone = client.delete_sample(name)
+    yield gone
+    yield f"deleted: {gone.name}, {gone.bytes} bytes"
+
+
+def delete_correction(twin: Twin, name: str = argument(..., "NAME")) -> Answer:
+    """Delete a correction that is not in force from the twin.
+
+    Args:
+        name: Of the correction.
+    """
+    with twin() as client:
+        gone = client.delete_calibration(name)
+    yield gone
+    yield f"deleted: {gone.name}"
+
+
 def snap(
     twin: Twin,
     file: Path = argument(..., "FILE.{tif,png}"),

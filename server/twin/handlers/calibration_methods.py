@@ -8,6 +8,7 @@ from flexdt.protocol.fields import Empty, Params
 from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods import calibration_messages as p
 from flexdt.protocol.methods.calibration_messages import DATASET_FRAME, DATASET_GET, DATASET_LIST
+from flexdt.server.storage.memory import Memory
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers import handler as h
 
@@ -58,6 +59,29 @@ async def revert(twin: TwinServer, client: h.Client, params: Empty) -> p.Correct
         ready = h.ensure_allowed(twin, client, "calibration.revert")
         warnings = await h.change_stage(twin, twin.scanner.sample, before, ready, history=history)
     return _in_force(twin, "the correction was reverted", warnings)
+
+
+@h.answers(p.CALIBRATION_DELETE)
+async def delete(
+    twin: TwinServer, client: h.Client, params: p.CalibrationDelete
+) -> p.CorrectionDeleted:
+    """Gone from the list and from what `revert` goes back through; data sets keep theirs."""
+    async with twin.stage_turn:
+        history = twin.corrections.without(params.name)
+        ready = h.ensure_allowed(twin, client, "calibration.delete")
+
+        def after(memory: Memory) -> Memory:
+            return memory.model_copy(update={"corrections": history})
+
+        def take() -> None:
+            ready()
+            twin.corrections.forget(params.name, history)
+
+        await twin.keeper.keep(
+            take, after, lambda changes: twin.corrections.remove(changes, params.name)
+        )
+    twin.tell("info", f"correction {params.name!r} was deleted")
+    return p.CorrectionDeleted(name=params.name)
 
 
 def _in_force(twin: TwinServer, message: str, warnings: list[str]) -> p.CorrectionResult:

@@ -7,6 +7,7 @@ import base64
 import binascii
 import contextlib
 from collections.abc import Callable
+from datetime import timedelta
 from typing import TypeAlias
 
 from flexdt.protocol import Method
@@ -15,6 +16,7 @@ from flexdt.protocol.fields import Empty
 from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods import job_messages as p
 from flexdt.protocol.rpc_errors import invalid_params, too_large
+from flexdt.runtime.files.own_documents import Changes
 from flexdt.server.scans.scan_job import ENDED, Job
 from flexdt.server.scans.scan_record import ScanSource
 from flexdt.server.twin.core import TwinServer
@@ -102,6 +104,25 @@ async def list_jobs(twin: TwinServer, client: h.Client, params: Empty) -> p.JobL
     """All jobs, oldest first."""
     jobs = await h.in_turns(twin.jobs.all(), twin.jobs.status)
     return await h.encoded_apart(client, p.JobListResult(jobs=jobs), len(jobs))
+
+
+@h.answers(p.JOB_FORGET)
+async def forget(twin: TwinServer, client: h.Client, params: p.JobForget) -> p.JobForgetResult:
+    """Ended jobs are not listed any more; what is incomplete goes on if it is submitted again."""
+    jobs = twin.jobs.ended(params.job, timedelta(days=params.days or 0.0))
+
+    def files(changes: Changes) -> None:
+        for job in jobs:
+            twin.job_files.remove(changes, job.id)
+
+    def take() -> list[Job]:
+        gone = [job for job in jobs if job.phase in ENDED]  # one may have been resumed meanwhile
+        twin.jobs.forget(gone)
+        twin.changed()
+        return gone
+
+    gone = await twin.keeper.keep(take, files=files)
+    return p.JobForgetResult(jobs=[job.id for job in gone])
 
 
 async def _when(twin: TwinServer, job: Job, condition: Callable[[], bool]) -> w.JobStatus:

@@ -9,12 +9,16 @@ from flexdt.phantoms import Phantom, load_phantom, materials, phantom_names
 from flexdt.protocol.fields import Empty
 from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods import scanner_messages as p
+from flexdt.protocol.rpc_errors import busy
 from flexdt.server.storage.sample_uploads import UploadHead
 from flexdt.server.storage.stored_samples import EMPTY
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers import handler as h
 from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.scanner.state import Sample, StagePlacement
+
+NAMED = 50
+"""Uploads that an error lists, the newest."""
 
 
 @h.answers(p.SAMPLE_SET)
@@ -115,6 +119,49 @@ async def upload(twin: TwinServer, client: h.Client, params: p.SampleUpload) -> 
     )
 
 
+@h.answers(p.SAMPLE_DELETE)
+async def delete(
+    twin: TwinServer, client: h.Client, params: p.SampleDelete
+) -> p.SampleDeleteResult:
+    """Refused for what stands on the stage or is in a scan that has not ended."""
+    name, ready = params.name, h.ensure_allowed(twin, client, "sample.delete")
+    async with twin.samples.turn, twin.stage_turn:
+        head = twin.samples.head(name)
+        if head is None:
+            raise _unknown(twin, name)
+        _ensure_unused(twin, name)
+
+        def take() -> None:
+            ready()
+            _ensure_unused(twin, name)
+            twin.samples.forget(name)
+
+        await twin.keeper.keep(take, files=lambda changes: twin.samples.remove(changes, name))
+        await asyncio.to_thread(twin.samples.tidy)
+    twin.tell("info", f"sample {name!r} was deleted", bytes=head.total)
+    return p.SampleDeleteResult(name=name, bytes=head.total)
+
+
+def _ensure_unused(twin: TwinServer, name: str) -> None:
+    """Check that a sample is needed by nothing.
+
+    Raises:
+        LimitError: it stands on the stage.
+        RpcError: -32003, a scan of it has not ended; names the job.
+    """
+    if name == twin.scanner.sample.name:
+        raise LimitError(
+            f"{name!r} stands on the stage and cannot be deleted",
+            {"asked": name, "allowed": "sample.set of another one first"},
+        )
+    job = twin.jobs.showing(name)
+    if job is not None:
+        raise busy(
+            f"{name!r} is in {job.id}, which is {job.phase}, and cannot be deleted",
+            {"asked": name, "job": job.id, "allowed": "job.abort"},
+        )
+
+
 def _ensure_idle_if_used(twin: TwinServer, client: h.Client, name: str) -> None:
     """Check that a sample may change: if it is on the stage, under this connection's control and in
     no scan.
@@ -143,8 +190,10 @@ def _upload_info(head: UploadHead) -> p.SampleInfo:
 
 
 def _unknown(twin: TwinServer, name: str) -> UnknownNameError:
-    uploads = list(twin.samples.uploads)
-    there = f"there are: {', '.join(uploads)}" if uploads else "nothing has been uploaded yet"
+    uploads = list(twin.samples.uploads)[-NAMED:]
+    older = len(twin.samples.uploads) - len(uploads)
+    more = f"{older} older ones and " if older else ""
+    there = f"there are: {more}{', '.join(uploads)}" if uploads else "nothing has been uploaded yet"
     return UnknownNameError(
         f"no upload called {name!r}; {there}", {"asked": name, "allowed": uploads}
     )

@@ -1,0 +1,147 @@
+"""Jobs as they were, one small file each under DATA/jobs/status.
+
+A change of a job writes that job's file alone, so it costs the same however many jobs there are.
+What a scan starts from is in DATA/jobs, one file a data set (`server/scans/scan_record.py`).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from contextlib import suppress
+from datetime import datetime
+from typing import Annotated, Literal
+
+from annotated_types import Ge, Le
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+from flexdt.protocol.fields import SpeedUp
+from flexdt.protocol.state_model import JobPhase
+from flexdt.runtime.files import own_documents as own
+from flexdt.runtime.files.directory import Directory
+from flexdt.twin.dataset.dataset_errors import DatasetWriteError
+from flexdt.twin.dataset.file_names import plain_name
+
+RECORDS = "jobs"
+"""The folder of what scans start from."""
+FOLDER = "status"
+"""The folder of these files in it."""
+NUMBERED = re.compile(r"job-(\d{1,15})")
+
+Seconds = Annotated[float, Ge(0), Le(1e12)]
+Count = Annotated[int, Ge(0), Le(2**53)]
+
+
+class JobMemory(BaseModel):
+    """One job as it was.
+
+    Attributes:
+        ended: when it ended, by the server's calendar; None while it has not.
+    """
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", populate_by_name=True, allow_inf_nan=False
+    )
+
+    id: str
+    name: str
+    folder: Annotated[str, AfterValidator(plain_name)]
+    phase: JobPhase
+    frames_total: Count
+    frames_done: Count
+    duration_s: Seconds
+    elapsed_s: Seconds = 0.0
+    speed_up: SpeedUp | None = None
+    warnings: list[str] = Field(default_factory=list)
+    error: dict[str, object] | None = None
+    ended: datetime | None = None
+
+
+class JobFile(JobMemory):
+    """A job as a document."""
+
+    schema_version: Literal[1] = Field(alias="schema")
+
+
+class JobFiles:
+    """The files of all jobs; any thread may call.
+
+    Args:
+        root: the data directory.
+    """
+
+    def __init__(self, root: Directory) -> None:
+        self._records = root.folder(RECORDS)
+        self._folder = self._records.folder(FOLDER)
+
+    def read(self) -> list[JobMemory]:
+        """Every job in the order made; files that cannot be read are set aside."""
+        found = []
+        for file in own.ours(self._folder):
+            without = "a job cannot be read; without it (its data set stays)"
+            job = own.read_or_set_aside(self._folder, file, _reader(file), without)
+            if job is not None:
+                found.append(job)
+        return sorted(found, key=lambda job: number_of(job.id))
+
+    def put(self, changes: own.Changes, job: JobMemory) -> None:
+        """Write a job, among other changes.
+
+        Raises:
+            DatasetWriteError: the system refuses.
+        """
+        self._records.make()
+        changes.put(self._folder, _file(job.id), _text(job))
+
+    def remove(self, changes: own.Changes, job: str) -> None:
+        """Forget a job, among other changes; nothing to do where there is no file."""
+        changes.remove(self._folder, _file(job))
+
+    def write(self, name: str, job: JobMemory | None) -> None:
+        """Write a job that has changed; None forgets it.
+
+        Raises:
+            DatasetWriteError: the system refuses.
+        """
+        if job is None:
+            self._folder.discard(_file(name))
+        else:
+            self._records.make()
+            self._folder.keep(_file(name), _text(job))
+
+    def clear(self) -> None:
+        """Forget every job."""
+        for file in own.ours(self._folder):
+            with suppress(DatasetWriteError):
+                self._folder.discard(file)
+
+    def settle(self) -> None:
+        """At the start: delete what killed writers left; what is no folder is set aside."""
+        own.settle(self._records, [FOLDER])
+
+
+def number_of(job: str) -> int:
+    """The number in a job's name; 0 for a name that is none of ours."""
+    match = NUMBERED.fullmatch(job)
+    return 0 if match is None else int(match[1])
+
+
+def _file(job: str) -> str:
+    return f"{own.file_stem(job)}.json"
+
+
+def _text(job: JobMemory) -> bytes:
+    document = JobFile(schema=1, **job.model_dump())
+    return document.model_dump_json(by_alias=True, indent=1).encode("utf-8")
+
+
+def _reader(file: str) -> Callable[[bytes], JobMemory]:
+    """Reads a job's file, which must be about the job that its name says."""
+
+    def read(data: bytes) -> JobMemory:
+        found = JobFile.model_validate(own.read_json(data))
+        if file != _file(found.id):
+            raise ValueError(f"it is about {found.id!r}")
+        return JobMemory.model_validate(found.model_dump(exclude={"schema_version"}))
+
+    return read
