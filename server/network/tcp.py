@@ -34,7 +34,7 @@ from flexdt.protocol.rpc_errors import ProtocolError, RpcError
 from flexdt.runtime.access import ConnectionLimits, check_bind
 from flexdt.runtime.log import Sparing
 from flexdt.runtime.process import ListeningServer, tune
-from flexdt.server.network import admission, deadlines, loop_turns, outbox
+from flexdt.server.network import admission, batches, deadlines, loop_turns, outbox
 from flexdt.server.network import shell_parts as parts
 
 READ_AHEAD = 512 << 10
@@ -174,6 +174,8 @@ class _Link(asyncio.BufferedProtocol):
         self.allowance = 0.0
         self.allowance_at = 0.0
         self.out = outbox.Outbox(self)
+        self.split: dict[int, batches.Split] = {}
+        """Batches whose urgent items have been begun; the others wait in the queue, by identity."""
         self.worker: asyncio.Task[None] | None = None
         self.tasks: set[asyncio.Task[None]] = set()
         self.deadlines = deadlines.Deadlines(
@@ -240,7 +242,7 @@ class _Link(asyncio.BufferedProtocol):
         """Begin with what is urgent of what has come, wherever in the queue it stands."""
         if self.gone.is_set() or not self.let_in:
             return
-        found: list[m.Message] = []
+        found: list[Coroutine[object, object, None]] = []
 
         def wanted(raw: bytes) -> bool:
             if len(raw) > LARGE:
@@ -251,13 +253,17 @@ class _Link(asyncio.BufferedProtocol):
                 4 if lane == loop_turns.FIRST else 1
             ):
                 return False
-            found.append(message)
+            if isinstance(message, m.Batch) and not all(map(self._urgent, message.items)):
+                split = self.split[id(raw)] = batches.Split(raw, self._batch(message.items))
+                found.append(self._begin(split))
+                return False  # its other items wait where they stand
+            found.append(self._serve(message, urgent=True))
             return True
 
         if self.wire.unjudged:
             self.wire.overtake(self.server.urgent, wanted)
-            for message in found:
-                self._start(self._serve(message, urgent=True))
+            for work in found:
+                self._start(work)
             self.estop_came = self.estop_came and self.wire.unjudged
             if self.estop_came:
                 self.loop.call_soon(self.overtake)
@@ -364,6 +370,9 @@ class _Link(asyncio.BufferedProtocol):
             return loop_turns.ORDINARY
         return loop_turns.FIRST if name == ESTOP else loop_turns.URGENT
 
+    def _urgent(self, message: m.Message | parts.Frozen) -> bool:
+        return self._lane(message) != loop_turns.ORDINARY
+
     async def _work(self) -> None:
         while True:
             while self.wire.whole:
@@ -378,6 +387,9 @@ class _Link(asyncio.BufferedProtocol):
                     return
                 if isinstance(raw, m.Malformed):
                     await self._serve(raw)
+                elif (split := self.split.pop(id(raw), None)) is not None:
+                    await split.urgent_done.wait()
+                    await self._answer_batch(split.batch, waits=False)
                 elif raw is not None:
                     await self._serve(await self._decoded(raw))
             if self.ended:
@@ -418,42 +430,45 @@ class _Link(asyncio.BufferedProtocol):
         """Answer one message, in a turn that it has; urgent: get one first."""
         match message:
             case m.Batch(items):
-                body = await self._batch(items, urgent)
+                await self._answer_batch(self._batch(items), waits=urgent)
             case tuple():
-                body = await self._batch(message, urgent)
+                await self._answer_batch(self._batch(message), waits=urgent)
             case _:
                 if urgent:
                     await self._turn(message)
                 answer = await self._answer(message)
-                body = None if answer is None else self.out.encode(answer)
-        if body is not None:
-            self.out.send(body)
-            await self.out.room()
+                if answer is not None:
+                    await self._send(self.out.encode(answer))
 
-    async def _batch(
-        self, items: Sequence[m.Single | parts.Frozen], waits: bool
-    ) -> list[bytes] | None:
-        """Each item in a turn of its own, urgent ones first; answers in the order of the batch.
+    def _batch(self, items: Sequence[m.Single | parts.Frozen]) -> batches.Batch:
+        return batches.Batch(items, self._lane, MAX_ANSWER[self.codec])
 
-        An answer is encoded when it is made; where all together become too large, the others are
-        refused without being made.
-        """
-        bodies: dict[int, list[bytes]] = {}
-        size, most = 0, MAX_ANSWER[self.codec]
-        for i, item in sorted(enumerate(items), key=lambda each: self._lane(each[1])):
+    async def _begin(self, split: batches.Split) -> None:
+        """Serve a batch's urgent items; the others follow when the batch's turn comes."""
+        try:
+            await self._items(split.batch, waits=True, urgent_alone=True)
+        finally:
+            split.urgent_done.set()
+
+    async def _answer_batch(self, batch: batches.Batch, *, waits: bool) -> None:
+        await self._items(batch, waits=waits)
+        if bodies := batch.bodies():
+            await self._send(self.wire.batch(bodies))
+
+    async def _items(
+        self, batch: batches.Batch, *, waits: bool, urgent_alone: bool = False
+    ) -> None:
+        """Each item that is left in a turn of its own; waits: the first one, too."""
+        while (item := batch.next_item(urgent_alone=urgent_alone)) is not None:
             if waits:
                 await self._turn(item)
             waits = True
-            full = size > most and self._lane(item) == loop_turns.ORDINARY
-            error = errors.too_large("the answers to a batch", f"more than {most}", most)
-            answer = await self._answer(item, error if full else None)
-            if answer is not None:
-                bodies[i] = self.out.encode(answer)
-                more = sum(map(len, bodies[i]))
-                if size + more > most:
-                    bodies[i] = self.out.encode(m.Failure(answer.id, error))
-                size += more
-        return self.wire.batch([b for _, b in sorted(bodies.items())]) if bodies else None
+            full = batch.full and not self._urgent(item)
+            batch.keep(await self._answer(item, batch.too_large if full else None), self.out.encode)
+
+    async def _send(self, body: list[bytes]) -> None:
+        self.out.send(body)
+        await self.out.room()
 
     async def _turn(self, message: m.Message | parts.Frozen) -> None:
         await self.server.turns.take(self, self._lane(message))
