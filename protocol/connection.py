@@ -46,9 +46,11 @@ _WINDOWS: Final = (4096, 2**20)
 _ATTEMPTS: Final = 4
 
 _size = struct.Struct(">I").unpack_from
-_HTTP: Final = re.compile(
-    rb"(?:GET|HEAD|POST|PUT|DELETE|CONNECT|OPTIONS|TRACE|PATCH|PRI) \S{0,8192} HTTP/"
-)
+_HTTP: Final = re.compile(rb"[!#$%&'*+.^_`|~0-9A-Za-z-]+ [^ ]* HTTP/|host[ \t]*:", re.IGNORECASE)
+"""How a line of an HTTP request's head begins: TOKEN SP TARGET SP HTTP/, or the field `Host` (RFC
+9112, 3 and 3.2). A browser sends methods of any name, and always a Host; no JSON begins so."""
+_HTTP_MARKS: Final = b" http/", b"host"
+"""What bytes in lower case hold if one of their lines may begin so."""
 
 
 class Prepared:
@@ -154,7 +156,7 @@ class Connection:
 
     def _feed_lines(self, data: bytes) -> None:
         first, last = data.find(b"\n") + 1, data.rfind(b"\n") + 1
-        if first == last or len(data) > self.max_message or b" HTTP/" in data:
+        if first == last or len(data) > self.max_message or _may_hold_http(data):
             self._feed_each_line(data)
             return
         # Of many short lines only the first, which may have begun before, can be one to refuse.
@@ -332,6 +334,12 @@ class Connection:
             RpcError: -32008, a MessagePack frame of 16 MiB or more.
         """
         return _framed(self.codec or Codec.JSON, body)
+
+
+def _may_hold_http(data: bytes) -> bool:
+    """Whether lines have to be looked at one by one for the head of an HTTP request."""
+    lower = data.lower()
+    return any(mark in lower for mark in _HTTP_MARKS)
 
 
 def _joined(messages: Iterable[bytes | Malformed]) -> bytes:

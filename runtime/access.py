@@ -15,6 +15,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
+from urllib.parse import urlsplit
 
 
 class AccessError(ValueError):
@@ -148,6 +149,21 @@ def is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
+
+
+def is_rebound(host: str) -> bool:
+    """Whether a request to a loopback port is that of a page whose site's name was rebound to it.
+
+    A page may send requests to its own site without being asked, and its site may say that its name
+    is now 127.0.0.1 (DNS rebinding). Its browser sends that name as the request's Host.
+
+    Args:
+        host: the request's Host, with or without a port; "" where there is none.
+
+    Raises:
+        ValueError: no Host that can be read.
+    """
+    return not is_loopback(urlsplit(f"//{host}").hostname or "")
 
 
 def check_bind(host: str, token: str | None) -> None:

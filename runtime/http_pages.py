@@ -1,9 +1,13 @@
 """Pages for monitoring, `/healthz` and `/metrics`, by the threads of prometheus_client's server.
 
 Beyond the loopback, pages other than `/healthz` need the server's token (`Authorization: Bearer
-...`). Twin, projector and viewer supply the figures; this module puts them into the pages. A page
-is made in a turn of the event loop, to which the figures belong. Requests are counted as they are
-answered; gauges are read at the moment of the scrape.
+...`); on the loopback, requests of other sites' pages are refused by their Host. Twin, projector
+and viewer supply the figures; this module puts them into the pages. A page is made in a turn of the
+event loop, to which the figures belong. Requests are counted as they are answered; gauges are read
+at the moment of the scrape.
+
+Each connection has a thread. One that has not sent a whole request that is answered waits in a room
+(`runtime/waiting_room.py`); so does one that is being answered, in a second room.
 """
 
 from __future__ import annotations
@@ -11,28 +15,44 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import logging
 import socket
+import sys
 from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
 from http import HTTPStatus
-from threading import Thread
+from threading import Lock, Thread
 from typing import Any, Final
 from wsgiref.simple_server import WSGIRequestHandler, make_server
 
 from prometheus_client import Counter, Metric, ProcessCollector, generate_latest
 from prometheus_client.exposition import ThreadingWSGIServer
 
-from flexdt.runtime.access import check_bind, is_loopback, read_token, token_matches
-from flexdt.runtime.log import dropped
-from flexdt.runtime.process import ServerLoop, durations
+from flexdt.runtime.access import (
+    check_bind,
+    is_loopback,
+    is_rebound,
+    read_token,
+    token_matches,
+)
+from flexdt.runtime.log import dropped, log
+from flexdt.runtime.process import BACKLOG, ServerLoop, durations
 from flexdt.runtime.process_settings import ServerSettings
+from flexdt.runtime.waiting_room import Room, neighbourhood
 
 SILENT_S: Final = 5.0
 """A client that sends nothing for so long is left."""
 HELD_S: Final = 60.0
 """An event loop that gives no page for so long is told as failed (503)."""
+STRANGERS: Final = 64
+"""Connections that may wait for the end of their request: where one address opens 167 a second,
+each of them still has 0.4 s for it."""
+ANSWERED: Final = 16
+"""Requests that may be answered at a time."""
+ADMIT: Final = "flexdt.admit"
+"""Key of a request's environment: what to call once it is to be answered."""
 OPEN_PAGES: Final = ("/healthz",)
 CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 
@@ -99,21 +119,87 @@ Pages = Mapping[str, Callable[[], HttpResponse]]
 """Path -> function that makes the page."""
 
 
+@dataclass(eq=False)
+class _Visitor:
+    """A connection, as the rooms see it."""
+
+    sock: socket.socket
+    address: str
+
+    def displace(self) -> None:
+        """Wake its thread, which finds the connection closed."""
+        with contextlib.suppress(OSError):
+            self.sock.shutdown(socket.SHUT_RDWR)
+
+
+class _Server(ThreadingWSGIServer):
+    """A thread for each connection, of which so many may be as the rooms hold."""
+
+    request_queue_size = BACKLOG
+
+    def __init__(self, *given: Any, **more: Any) -> None:
+        self._strangers, self._answered = Room[_Visitor](STRANGERS), Room[_Visitor](ANSWERED)
+        self._here: dict[object, _Visitor] = {}
+        self._lock = Lock()
+        super().__init__(*given, **more)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Let a connection in, and start its thread."""
+        visitor = _Visitor(request, neighbourhood(str(client_address[0])))
+        with self._lock:
+            self._here[request] = visitor
+            self._strangers.enter(visitor)
+        super().process_request(request, client_address)
+
+    def admit(self, request: Any) -> None:
+        """Its request is answered."""
+        with self._lock:
+            self._strangers.leave(self._here[request])
+            self._answered.enter(self._here[request])
+
+    def shutdown_request(self, request: Any) -> None:
+        """A connection has ended, or its thread could not be started."""
+        with self._lock:
+            visitor = self._here.pop(request)
+            self._strangers.leave(visitor)
+            self._answered.leave(visitor)
+        super().shutdown_request(request)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Log what is not the end of a connection."""
+        if not isinstance(sys.exc_info()[1], OSError):
+            log("http page failed", logging.ERROR, error=True)
+
+
 class _Handler(WSGIRequestHandler):
     """One connection: a request, and nothing in the log, which holds lines of JSON."""
 
     timeout = SILENT_S
+    server: _Server
+
+    def get_environ(self) -> dict[str, Any]:
+        """What the application is told, with how it tells that it answers the request."""
+        return {**super().get_environ(), ADMIT: partial(self.server.admit, self.connection)}
 
     def log_message(self, format: str, *args: object) -> None:
         """Log nothing."""
 
 
-def _application(pages: Pages, token: str | None) -> Callable[..., list[bytes]]:
+def _foreign(host: str) -> bool:
+    try:
+        return is_rebound(host)
+    except ValueError:
+        return True
+
+
+def _application(pages: Pages, token: str | None, *, loopback: bool) -> Callable[..., list[bytes]]:
     """The pages as a WSGI application, made by the loop that runs now."""
     loop = asyncio.get_running_loop()
 
-    def response(asked: Mapping[str, str]) -> HttpResponse:
+    def response(asked: Mapping[str, Any]) -> HttpResponse:
         path, given = asked["PATH_INFO"], asked.get("HTTP_AUTHORIZATION", "")
+        if loopback and "HTTP_HOST" in asked and _foreign(asked["HTTP_HOST"]):
+            return HttpResponse("{}", HTTPStatus.FORBIDDEN)
         if asked["REQUEST_METHOD"] not in ("GET", "HEAD"):
             return HttpResponse("{}", HTTPStatus.METHOD_NOT_ALLOWED)
         if path not in pages:
@@ -121,6 +207,7 @@ def _application(pages: Pages, token: str | None) -> Callable[..., list[bytes]]:
         said = given.removeprefix("Bearer ")
         if token is not None and path not in OPEN_PAGES and not token_matches(said, token):
             return HttpResponse("{}", HTTPStatus.UNAUTHORIZED)
+        asked[ADMIT]()
         made: Future[HttpResponse] = Future()
 
         def make() -> None:
@@ -169,10 +256,11 @@ async def served_pages(pages: Pages, settings: ServerSettings) -> AsyncIterator[
     host, token = settings.http_host, read_token(settings.token_file)
     check_bind(host, token)
 
-    class Server(ThreadingWSGIServer):
+    class Server(_Server):
         address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
 
-    application = _application(pages, None if is_loopback(host) else token)
+    loopback = is_loopback(host)
+    application = _application(pages, None if loopback else token, loopback=loopback)
     port = settings.http_port
     server = await asyncio.to_thread(make_server, host, port, application, Server, _Handler)
     Thread(target=server.serve_forever, name="http pages", daemon=True).start()

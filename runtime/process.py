@@ -13,6 +13,7 @@ which options.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import gc
 import json
 import logging
@@ -41,6 +42,8 @@ packet, which is sent again after a whole second: six seconds of 10 000 connecti
 TLS_HANDSHAKE_S = 10.0
 
 
+MOST_DESCRIPTORS: Final = 1 << 16
+"""Descriptors that a server asks the system for, where more are allowed."""
 BUCKETS_S = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.25, 1.0, 5.0)
 
 
@@ -262,6 +265,7 @@ def run_process(settings: S, run: Callable[[S], Coroutine[None, None, int]]) -> 
         settings: of the process; `host` and `port` are where it listens.
         run: the work; returns its own exit code.
     """
+    _allow_descriptors()
     try:
         with asyncio.Runner(loop_factory=ServerLoop) as runner:
             return runner.run(run(settings))
@@ -277,6 +281,18 @@ def run_process(settings: S, run: Callable[[S], Coroutine[None, None, int]]) -> 
             problem, code = f"{error.filename}: {error.strerror}", INVALID
     print(f"flexdt {settings.command}: {problem}", file=sys.stderr)
     return code
+
+
+def _allow_descriptors() -> None:
+    """Have as many descriptors as this process may: the usual 1024 are fewer than the places."""
+    try:
+        import resource
+    except ImportError:  # Windows has no such limit
+        return
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    most = MOST_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, MOST_DESCRIPTORS)
+    with contextlib.suppress(OSError, ValueError):  # macOS allows fewer than it says
+        resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, most), hard))
 
 
 def read_if_there(file: Path | None, parse: Callable[[str, str], T]) -> T | None:

@@ -37,6 +37,7 @@ from flexdt.protocol.acquila import (
 )
 from flexdt.runtime.access import AccessError, is_loopback
 from flexdt.runtime.log import log
+from flexdt.runtime.process import BACKLOG
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.grammar import own_name
 
@@ -51,6 +52,9 @@ MAX_RUNNING: Final = 256
 """Commands that may run at once; twice as many if they stop or abort something."""
 MAX_HELD: Final = 64
 """Events that ZeroMQ holds for each sender until they are read, of at most 1 MiB each."""
+HANDSHAKE_MS: Final = 3000
+"""A connection that has not introduced itself by then is closed: where 167 come a second, 500 are
+open. ZeroMQ's own is 30 s."""
 PAUSE_S: Final = 0.1
 ALWAYS: Final = frozenset({"stop", "abort script"})
 
@@ -327,6 +331,8 @@ class Gateway:
 
     def _socket(self, kind: int) -> zmq.asyncio.Socket:
         made = self._context.socket(kind)
+        made.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
+        made.setsockopt(zmq.BACKLOG, BACKLOG)
         if ":" in self.host:
             made.setsockopt(zmq.IPV6, 1)
         return made

@@ -10,11 +10,11 @@ import asyncio
 import contextlib
 import sys
 from collections.abc import Sequence
-from importlib.util import find_spec
 
 from flexdt.clients.client.kept_connection import KeptConnection, TwinAddress
 from flexdt.clients.gateway.connected_twin import ConnectedTwin
 from flexdt.library import machines
+from flexdt.library.extras import lacking
 from flexdt.runtime.access import client_tls, read_token
 from flexdt.runtime.log import set_up
 from flexdt.runtime.process import (
@@ -78,8 +78,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the process; returns its exit code."""
     options = parse(GatewaySettings, argv)
     set_up()
-    if find_spec("zmq") is None:
-        print("flexdt gateway: pyzmq is missing: pip install 'flexdt[gateway]'", file=sys.stderr)
+    if (missing := lacking("zmq", "pyzmq", "gateway")) is not None:
+        print(f"flexdt gateway: {missing}", file=sys.stderr)
         return INVALID
     return run_process(options, run)
 

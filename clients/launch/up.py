@@ -15,8 +15,9 @@ import sys
 from collections.abc import Sequence
 from typing import TextIO
 
+from flexdt.library.extras import lacking
 from flexdt.runtime.access import ViewerLimits, limit_names
-from flexdt.runtime.process import REFUSED
+from flexdt.runtime.process import INVALID, REFUSED
 from flexdt.runtime.process_settings import (
     LOOPBACK,
     Address,
@@ -113,7 +114,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         wanted.append((options.host, options.viewer_port))
     if options.gateway_port:
         wanted += [(LOOPBACK, options.gateway_port), (LOOPBACK, options.gateway_port + 1)]
-    # Before anything starts: a server would say it once its kernels are compiled.
+    # Before anything starts: a server would say it once its kernels are compiled, and end all.
+    missing = lacking("zmq", "pyzmq", "gateway") if options.gateway_port is not None else None
+    if missing is not None:
+        print(f"flexdt up: --gateway-port: {missing}", file=sys.stderr)
+        return INVALID
     for problem in filter(None, (port_problem(*place) for place in wanted)):
         print(f"flexdt up: {problem}", file=sys.stderr)
         return REFUSED

@@ -21,7 +21,7 @@ import ssl as tls
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final, cast
 from urllib.parse import SplitResult, parse_qs, urlsplit
 
 from websockets.asyncio.client import ClientConnection
@@ -31,24 +31,19 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
+from flexdt.clients.viewer.browser_connections import Admission, BrowserConnection
 from flexdt.clients.viewer.page_html import PAGE, page_file
 from flexdt.clients.viewer.page_messages import MessageFilter
 from flexdt.clients.viewer.viser_gate import MARK, parted
-from flexdt.runtime.access import check_bind, is_loopback, token_matches
+from flexdt.runtime.access import check_bind, is_loopback, is_rebound, token_matches
 from flexdt.runtime.log import log
-from flexdt.runtime.process import one_at_a_time
+from flexdt.runtime.process import TLS_HANDSHAKE_S, one_at_a_time
 
 COOKIE: Final = "flexdt_viewer"
 MAX_FROM_PAGE: Final = 16 << 20
 """Bytes of a message of a browser: a script of 8 MiB as JSON, a piece of an upload, a picture."""
-SPARE: Final = 64
-"""Connections beside pages and views: plain requests, and handshakes under way."""
 LAST: Final = {"Connection": "close"}
 """websockets closes after a plain answer; who is not told sends the next request into nothing."""
-MAX_HELD: Final = 256 << 20
-"""Bytes of messages that have begun and not ended, of all connections together."""
-FAIR: Final = 1 << 20
-"""A connection that holds no more than this is not cut for what others hold."""
 SILENT_S: Final = 60.0
 """A browser that does not answer a ping within this time has gone; busy machines are slow."""
 STILL_S: Final = 8.0
@@ -92,7 +87,7 @@ class Front:
         downloads: key -> file; taken out when fetched.
         token: a browser must show it once (`/?token=...`); None for none.
         max_scenes: views open at a time.
-        max_pages: pages open at a time; bounds connections, and `page` closes further pages.
+        max_pages: pages open at a time; `page` closes further ones, which have no place here.
         still: answers `/still.jpg`, the scene as a picture, from the query; None: not yet.
     """
 
@@ -110,7 +105,8 @@ class Front:
         self._page, self._connect = page, connect
         self.doorkeeper = MessageFilter()
         self._max_scenes, self.scenes = max_scenes, 0
-        self._most = max_scenes + max_pages + SPARE
+        self._max_pages, self._pages = max_pages, 0
+        self.admission = Admission()
         self._guessing, self._closing = asyncio.Lock(), asyncio.Event()
         self.wrong_tokens = 0
         self._downloads, self._token, self._still = downloads, token, still
@@ -145,10 +141,11 @@ class Front:
             host,
             port,
             ssl=ssl,
+            ssl_handshake_timeout=None if ssl is None else TLS_HANDSHAKE_S,
             process_request=self._answer,
             select_subprotocol=_first,
             compression=None,
-            create_connection=_bounded(self._most),
+            create_connection=cast(type[ServerConnection], self.admission.connection),
             logger=_quiet(),
             max_size=MAX_FROM_PAGE,
             max_queue=4,
@@ -175,6 +172,8 @@ class Front:
             denied = self._foreign(request) or await self._stranger(connection, request, url)
         except (ValueError, LookupError):  # brackets, bytes or headers that belong nowhere
             return _plain(http.HTTPStatus.BAD_REQUEST, "this request cannot be read")
+        if denied is None:
+            cast(BrowserConnection, connection).admit()
         if denied is None and url.path == "/still.jpg" and self._still is not None:
             asked, picture = {k: v[-1] for k, v in parse_qs(url.query).items()}, None
             with contextlib.suppress(TimeoutError):
@@ -214,10 +213,8 @@ class Front:
     def _foreign(self, request: Request) -> Response | None:
         """The response to a request from another site's page, or None."""
         host = request.headers.get("Host", "")
-        name = urlsplit(f"//{host}").hostname or ""
-        if self._loopback and not is_loopback(name):
-            # A foreign name that resolves to the loopback: a request from another site's page.
-            return _plain(http.HTTPStatus.FORBIDDEN, f"this viewer is not {name}")
+        if self._loopback and is_rebound(host):
+            return _plain(http.HTTPStatus.FORBIDDEN, f"this viewer is not {host}")
         origin = request.headers.get("Origin")
         if origin is not None and urlsplit(origin).netloc != host:
             return _plain(http.HTTPStatus.FORBIDDEN, f"requests from {origin} are not served")
@@ -255,10 +252,17 @@ class Front:
         assert connection.request is not None
         path = urlsplit(connection.request.path).path
         if (match := PAGE_PATH.fullmatch(path)) is not None:
-            await self._page(match[1], connection)
+            if self._pages < self._max_pages:
+                cast(BrowserConnection, connection).seat()
+            self._pages += 1
+            try:
+                await self._page(match[1], connection)
+            finally:
+                self._pages -= 1
         elif self.scenes >= self._max_scenes:
             await connection.close(1013, f"{self._max_scenes} views are open, and no more may be")
         else:
+            cast(BrowserConnection, connection).seat()
             self.scenes += 1
             try:
                 await self._relay(connection, path)
@@ -289,47 +293,6 @@ class Front:
 async def _down(viser: ClientConnection, browser: ServerConnection) -> None:
     async for message in viser:
         await browser.send(message)
-
-
-def _bounded(most: int) -> type[ServerConnection]:
-    """Connections that are cut where there are more than `most`, or all hold more than MAX_HELD."""
-    open_now = held_by_all = 0
-
-    class Bounded(ServerConnection):
-        held = 0
-        """Bytes that have come since a message was last taken."""
-
-        def connection_made(self, transport: asyncio.BaseTransport) -> None:
-            nonlocal open_now
-            open_now += 1
-            super().connection_made(transport)
-            if open_now > most:
-                self.transport.abort()
-
-        def data_received(self, data: bytes) -> None:
-            self._hold(self.held + len(data))
-            if held_by_all > MAX_HELD and self.held > FAIR:
-                self.transport.abort()
-            else:
-                super().data_received(data)
-
-        async def recv(self, decode: bool | None = None) -> Any:
-            message = await super().recv(decode)
-            self._hold(0)
-            return message
-
-        def connection_lost(self, exc: Exception | None) -> None:
-            nonlocal open_now
-            open_now -= 1
-            self._hold(0)
-            super().connection_lost(exc)
-
-        def _hold(self, size: int) -> None:
-            nonlocal held_by_all
-            held_by_all += size - self.held
-            self.held = size
-
-    return Bounded
 
 
 def _quiet() -> logging.Logger:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from importlib import import_module
 from importlib.metadata import entry_points
+from importlib.util import find_spec
 from typing import Any, Final
 
 from flexdt.twin.errors import TwinError
@@ -26,6 +27,17 @@ def package(
             f"{what} needs {name}, which is not installed: pip install '{distribution}[{extra}]'",
             {"missing": name},
         ) from None
+
+
+def lacking(module: str, name: str, extra: str) -> str | None:
+    """What to install for a module that is not there; None where it is. Imports nothing.
+
+    Args:
+        module: as it is imported.
+        name: of its distribution.
+        extra: of flexdt that brings it.
+    """
+    return None if find_spec(module) else f"{name} is missing: pip install 'flexdt[{extra}]'"
 
 
 def offered(name: str, group: str) -> Any:

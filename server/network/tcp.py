@@ -8,9 +8,10 @@ that does not read costs only its own connection: state events keep the newest v
 ordered events have a bounded queue, and what stays stuck is cut off. This module knows nothing of
 what methods mean, except that `session.hello` brings the token and that an E-stop comes first.
 
-A client takes one of `max_clients` places when it has shown the token (at once where there is
-none). Until then, and while all places are taken, it is in a `Room`: there it is answered to hello,
-and to what is urgent once it has shown the token where there is one, but to nothing else.
+A client takes one of `max_clients` places when it has shown the token, or with its first request
+where there is none. Until then, and while all places are taken, it is in a `Room`: there it is
+answered to hello, and to what is urgent once it has shown the token where there is one, but to
+nothing else.
 """
 
 from __future__ import annotations
@@ -31,9 +32,11 @@ from flexdt.protocol.fields import Params
 from flexdt.protocol.method import parse_params, require_compatible
 from flexdt.protocol.methods.session_messages import Hello
 from flexdt.protocol.rpc_errors import ProtocolError, RpcError
+from flexdt.runtime import waiting_room
 from flexdt.runtime.access import ConnectionLimits, check_bind
 from flexdt.runtime.log import Sparing
 from flexdt.runtime.process import ListeningServer, tune
+from flexdt.runtime.waiting_room import Room, neighbourhood
 from flexdt.server.network import admission, batches, deadlines, loop_turns, outbox
 from flexdt.server.network import shell_parts as parts
 
@@ -73,7 +76,7 @@ class TcpServer(ListeningServer):
 
     def __post_init__(self) -> None:
         self.links: set[_Link] = set()
-        self.waiting, self.reserved = admission.Room(admission.WAITING), admission.Room(RESERVED)
+        self.waiting, self.reserved = Room[_Link](waiting_room.WAITING), Room[_Link](RESERVED)
         self.lines = Sparing()
         self.turns = loop_turns.LoopTurns()
         self.urgent = tuple(x.name.encode() for x in self.methods.values() if x.urgent)
@@ -110,7 +113,7 @@ class TcpServer(ListeningServer):
         """Stop listening, end every connection, wait until all are gone."""
         if self.server is not None:
             self.server.close()
-        links: list[admission.Guest] = [*self.links, *self.waiting.guests, *self.reserved.guests]
+        links = {*self.links, *self.waiting.guests, *self.reserved.guests}
         for link in links:
             link.end()
         await asyncio.gather(*(link.gone.wait() for link in links))
@@ -193,22 +196,28 @@ class _Link(asyncio.BufferedProtocol):
         self.name = f"{peer[0]}:{peer[1]}#{self.number}"
         self.transport.set_write_buffer_limits(high=64 * 1024)
         tune(self.transport.get_extra_info("socket"))
-        self.address = admission.neighbourhood(str(peer[0]))
+        self.address = neighbourhood(str(peer[0]))
+        self.server.waiting.enter(self)
         if self.let_in:
             self._open()
         else:
-            self.server.waiting.enter(self)
             self.deadlines.start("hello", self.limits.hello_timeout_s)
         self.worker = self.loop.create_task(self._work())
         self.worker.add_done_callback(self._crashed)
 
     def _seat(self) -> bool:
-        """Take a place if there is one; whether it has one."""
-        links = self.server.links
-        if self not in links and len(links) < self.limits.max_clients:
-            links.add(self)
-            self.server.reserved.leave(self)
-        return self in links
+        """Take a place if there is one, or a reserved one; whether it has one of its own."""
+        server = self.server
+        if self in server.links:
+            return True
+        server.waiting.leave(self)
+        if len(server.links) < self.limits.max_clients:
+            server.links.add(self)
+            server.reserved.leave(self)
+            return True
+        if self not in server.reserved.guests:
+            server.reserved.enter(self)
+        return False
 
     def _no_place(self) -> RpcError:
         return errors.busy("too many clients", {"allowed": self.limits.max_clients})
@@ -345,10 +354,7 @@ class _Link(asyncio.BufferedProtocol):
         self.let_in = True
         self.loop.call_soon(self.overtake)  # what came before was not looked at
         self.deadlines.stop("hello")
-        self.server.waiting.leave(self)
         self._relax()
-        if not self._seat():
-            self.server.reserved.enter(self)
         try:
             self.session = self.server.open(self)
         except Exception:
@@ -516,8 +522,9 @@ class _Link(asyncio.BufferedProtocol):
             method = find(name, self.server.methods)
             if not method.urgent:
                 self._check_rate()
-                if not (self.let_in and self._seat()) and name != HELLO:
-                    raise self._no_place()
+            seated = self.let_in and self._seat()
+            if not (seated or method.urgent or name == HELLO):
+                raise self._no_place()
             if isinstance(given, RpcError):
                 raise given
             params = given if isinstance(given, Params) else parse_params(method, given)
@@ -540,6 +547,7 @@ class _Link(asyncio.BufferedProtocol):
         require_compatible(hello.protocol)  # before the session opens
         if not self.let_in:
             self._open()
+            self._seat()
 
     def _check_rate(self) -> None:
         rate = self.limits.requests_per_s

@@ -19,6 +19,7 @@ from flexdt.protocol import MAX_FRAME, Correlation, Notification, Role, image
 from flexdt.protocol.messages import Id
 from flexdt.protocol.rpc_errors import superseded
 from flexdt.runtime.log import Sparing
+from flexdt.runtime.waiting_room import neighbourhood
 from flexdt.server.network.admission import TokenCheck
 from flexdt.server.projector.compute import (
     ComputeJob,
@@ -44,15 +45,22 @@ class JobClient:
         self.jobs: dict[Id, ComputeJob] = {}
         self.calls: Correlation[None] = Correlation(Role.SERVER)
         self.tasks: set[asyncio.Task[None]] = set()
+        self.received = 0
+        """Messages so far."""
         self.pending_bytes = 0
-        self.token_check = TokenCheck(token, self._close_soon, lines)
+        self.address = neighbourhood(link.peer.rpartition(":")[0])
+        self.token_check = TokenCheck(token, self.close_soon, lines)
 
     def begin(self, id: Id, key: str | None = None) -> ComputeJob:
         """The work of a request, known by its id until that is answered."""
         job = self.jobs[id] = ComputeJob(self.lanes[key is not None], key)
         return job
 
-    def _close_soon(self) -> None:
+    def displace(self) -> None:
+        """A newer connection needs the room."""
+        self.link.transport.abort()
+
+    def close_soon(self) -> None:
         """End the connection once its last answer has gone out."""
         asyncio.get_running_loop().call_later(0.1, self.link.transport.close)
 

@@ -3,6 +3,10 @@
 Work is computed in turns (see `compute`) and results are sent as they are made. The methods are in
 `projector_methods`.
 
+A client takes one of `max_clients` places when it has shown the token, or with its first request
+where there is none. Until then it waits in a `Room`; without the token, small messages are taken
+from it, one at a time and few in all.
+
 On its health and metrics pages volumes are counted but not named, since names may reveal a user's
 samples.
 """
@@ -24,10 +28,12 @@ from flexdt.protocol import connection as frames
 from flexdt.protocol import messages as m
 from flexdt.protocol import rpc_errors as errors
 from flexdt.protocol.projector import PROJECTOR_METHODS
+from flexdt.runtime import waiting_room
 from flexdt.runtime.access import ConnectionLimits, check_bind
 from flexdt.runtime.http_pages import Pages, Requests, counter, gauge, watching_pages
 from flexdt.runtime.log import current, log
 from flexdt.runtime.process import ListeningServer
+from flexdt.runtime.waiting_room import Room
 from flexdt.server.network.shell_parts import Observe, answered, unobserved
 from flexdt.server.projector.compute import ComputeThread
 from flexdt.server.projector.job_context import Context, JobClient
@@ -38,6 +44,11 @@ from flexdt.twin.errors import TwinError
 
 MAX_PENDING_BYTES: Final = 64 * 2**20
 """Bytes of unanswered requests of one client above which it is not read any more."""
+HELLO: Final = "session.hello"
+STRANGER_FRAME: Final = 32 << 10
+"""Largest frame that is taken from a connection without the token [bytes]."""
+STRANGE: Final = 10
+"""Messages without the token after which a connection is closed."""
 Given = Mapping[str, object] | list[object] | None
 """Parameters of a call as they came."""
 
@@ -49,6 +60,10 @@ class ProjectorServer(ListeningServer):
     context: Context
     limits: ConnectionLimits
     observe: Observe
+
+    def __post_init__(self) -> None:
+        self.waiting = Room[JobClient](waiting_room.WAITING)
+        self.seated: set[JobClient] = set()
 
     async def close(self) -> None:
         """Stop listening, end all connections and the compute thread."""
@@ -69,18 +84,39 @@ class ProjectorServer(ListeningServer):
         """A client has connected."""
         client = JobClient(link, self.context.token, self.context.lines)
         self.context.clients[link] = client
-        if len(self.context.clients) > self.limits.max_clients:
-            allowed = {"allowed": self.limits.max_clients}
-            self.refuse(link, errors.busy("too many clients", allowed))
-        elif not client.let_in:
+        self.waiting.enter(client)
+        if not client.let_in:
+            link.max_frame = min(STRANGER_FRAME, link.max_frame)
             link.deadlines.start("hello", self.limits.hello_timeout_s)
 
     def lost(self, link: FrameLink) -> None:
         """A client has gone: nothing more is computed for it."""
         client = self.context.clients.pop(link)
+        self.waiting.leave(client)
+        self.seated.discard(client)
         self.context.store.forget(client)
         for task in client.tasks:
             task.cancel()
+
+    def _seat(self, client: JobClient) -> None:
+        """Give a client a place; one that has been let in may send whole frames.
+
+        Raises:
+            RpcError: -32003, all places are taken.
+        """
+        if client in self.seated:
+            return
+        if len(self.seated) >= self.limits.max_clients:
+            client.close_soon()
+            raise errors.busy("too many clients", {"allowed": self.limits.max_clients})
+        self.waiting.leave(client)
+        self.seated.add(client)
+        client.link.max_frame = self.largest_frame
+
+    @property
+    def largest_frame(self) -> int:
+        """Largest frame that is taken from a client [bytes]."""
+        return min(MAX_FRAME, self.limits.max_message)
 
     def refuse(self, link: FrameLink, error: RpcError) -> None:
         """Send an error and end the connection."""
@@ -93,8 +129,12 @@ class ProjectorServer(ListeningServer):
         if len(client.tasks) >= self.limits.max_waiting:
             self.refuse(link, errors.busy("too many requests under way"))
             return
+        client.received += 1
+        if not client.let_in and client.received > STRANGE:
+            self.refuse(link, errors.not_authorised())
+            return
         client.pending_bytes += len(body)
-        if client.pending_bytes > MAX_PENDING_BYTES:
+        if client.pending_bytes > MAX_PENDING_BYTES or not client.let_in:
             link.transport.pause_reading()
         task = asyncio.get_running_loop().create_task(self._serve(client, body))
         client.tasks.add(task)
@@ -149,11 +189,16 @@ class ProjectorServer(ListeningServer):
         self, client: JobClient, id: m.Id, name: str, given: Given
     ) -> m.Response | m.Failure:
         try:
-            if not client.let_in and name != "session.hello":
+            if not client.let_in and name != HELLO:
                 raise errors.not_authorised()
             method = find(name, PROJECTOR_METHODS)
             params = parse_params(method, given)
-            return m.Response(id, await ANSWERS[name](self.context, client, id, params))
+            if client.let_in:
+                self._seat(client)
+            answer = await ANSWERS[name](self.context, client, id, params)
+            if name == HELLO:
+                self._seat(client)  # it has shown the token
+            return m.Response(id, answer)
         except RpcError as error:
             return m.Failure(id, error)
         except TwinError as error:
@@ -213,7 +258,7 @@ async def serve_projector(
                 server.refuse,
                 server.lost,
                 server.made,
-                max_frame=min(MAX_FRAME, limits.max_message),
+                max_frame=server.largest_frame,
                 send_timeout_s=limits.send_timeout_s,
                 frame_timeout_s=limits.message_timeout_s,
             ),
@@ -241,7 +286,7 @@ def projector_pages(server: ProjectorServer, requests: Requests) -> Pages:
     def figures() -> list[Metric]:
         store = context.store
         return [
-            gauge("flexdt_connections", "Clients connected.", len(context.clients)),
+            gauge("flexdt_connections", "Clients connected.", len(server.seated)),
             counter("flexdt_views_total", "Views projected.", context.views),
             counter("flexdt_superseded_total", "Requests overtaken.", context.superseded),
             gauge("flexdt_waiting", "Pieces of work that wait.", context.waiting),

@@ -29,8 +29,8 @@ from flexdt.protocol import (
 from flexdt.protocol.fields import Params
 from flexdt.runtime.access import ConnectionLimits
 from flexdt.runtime.log import JsonLines, Sparing
+from flexdt.runtime.waiting_room import Room, neighbourhood
 from flexdt.server.network import tcp
-from flexdt.server.network.admission import Room, neighbourhood
 from flexdt.server.network.shell_parts import Peer
 from flexdt.server.network.tcp import TcpServer, serve
 
@@ -103,7 +103,7 @@ NEW = ("session.hello", "session.ping", "safety.estop")
 def test_new_clients_are_served_whatever_peers_without_the_token_do(
     seed: int, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(tcp.admission, "WAITING", 12)
+    monkeypatch.setattr(tcp.waiting_room, "WAITING", 12)
     monkeypatch.setattr(tcp, "RESERVED", 3)
     rng = random.Random(seed)
 
@@ -247,14 +247,20 @@ def test_without_a_token_a_crowd_at_a_full_server_displaces_only_its_own(
         app = App()
         server = await serve(app.open, limits=ConnectionLimits(max_clients=2))
         holders = [await Client.dial(server, OTHER) for _ in range(2)]
-        crowd = [await Client.dial(server, PEER) for _ in range(30)]
-        while server.opened < 32:
-            await asyncio.sleep(0)
+        for holder in holders:
+            await served(holder, "state.get")
+
+        async def came() -> Client:
+            one = await Client.dial(server, PEER)
+            assert (await one.ask(request("state.get")))["error"]["code"] == -32003
+            return one
+
+        crowd = [await came() for _ in range(30)]
         assert len(server.reserved.guests) == 8
 
         late = await Client.dial(server)
         for count in range(1, 4):
-            crowd += [await Client.dial(server, PEER) for _ in range(20)]
+            crowd += [await came() for _ in range(20)]
             assert (await late.ask(hello(None)))["result"] == {"method": "session.hello"}
             assert (await late.ask(request("state.get")))["error"]["code"] == -32003
             await served(late, "safety.estop", "session.ping")
@@ -266,6 +272,28 @@ def test_without_a_token_a_crowd_at_a_full_server_displaces_only_its_own(
         for client in (*holders, *crowd, late):
             client.writer.close()
         await server.close()
+
+    asyncio.run(asyncio.wait_for(main(), 60))
+
+
+def test_without_a_token_who_says_nothing_takes_no_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tcp.waiting_room, "WAITING", 8)
+
+    async def main() -> None:
+        app = App()
+        server = await serve(app.open, limits=ConnectionLimits(max_clients=2))
+        client = await Client.dial(server, PEER)
+        await served(client, "state.get")
+        silent = [await Client.dial(server, PEER) for _ in range(40)]
+        while server.opened < 41:
+            await asyncio.sleep(0)
+        assert len(server.waiting.guests) == 8
+        for other in silent[:32]:  # the oldest have gone
+            assert json.loads(await other.end())["error"]["code"] == -32003
+        late = await Client.dial(server, PEER)
+        await served(late, "state.get", "safety.estop")
+        await served(client, "state.get", "axes.stop")  # it had its place
+        await _ended(server, client, late, *silent)
 
     asyncio.run(asyncio.wait_for(main(), 60))
 

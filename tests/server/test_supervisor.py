@@ -19,6 +19,7 @@ from typing import Any
 
 import pytest
 
+from flexdt.clients.launch import up as launch_up
 from flexdt.clients.launch.up import main as up_main
 from flexdt.clients.launch.up import services
 from flexdt.runtime import process as processes
@@ -419,6 +420,21 @@ def test_up_ends_where_a_port_is_taken(
     captured = capfd.readouterr()
     assert captured.out == ""
     assert f"cannot listen on 127.0.0.1:{port}" in captured.err
+
+
+def test_up_starts_nothing_where_the_gateway_lacks_its_package(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run_supervisor(*_: object) -> None:
+        raise AssertionError("nothing is to start")
+
+    monkeypatch.setattr(launch_up, "Supervisor", run_supervisor)
+    monkeypatch.setitem(sys.modules, "zmq", None)
+    assert up_main(["--port", "0", "--projector-port", "0", "--gateway-port", "0"]) == 1
+    captured = capfd.readouterr()
+    assert captured.out == ""
+    said = "flexdt up: --gateway-port: pyzmq is missing: pip install 'flexdt[gateway]'\n"
+    assert captured.err == said
 
 
 def test_addresses_read_as_urls_have_them() -> None:

@@ -323,11 +323,10 @@ def test_end_of_file_inside_a_message_is_answered_with_an_error(last: bytes) -> 
 
 def test_a_client_that_never_reads_loses_values_and_then_only_its_own_connection() -> None:
     async def body(server: TcpServer, app: FakeApp) -> None:
-        _, deaf = await dial(server)
+        heard, deaf = await dial(server)
         reader, writer = await dial(server)
+        await ask(heard, deaf, call("state.get"))
         await ask(reader, writer, call("state.get"))
-        while len(app.peers) < 2:
-            await asyncio.sleep(0.005)
         deaf.transport.pause_reading()  # type: ignore[attr-defined]
         payload = "x" * 200_000
         for seq in range(200):
@@ -528,9 +527,8 @@ def test_limits_on_clients_rate_and_broken_messages() -> None:
 
 def test_one_too_many_is_told_in_its_own_codec_until_there_is_a_place() -> None:
     async def body(server: TcpServer, app: FakeApp) -> None:
-        _, first = await dial(server)
-        while not app.peers:
-            await asyncio.sleep(0)
+        heard, first = await dial(server)
+        await ask(heard, first, call("session.ping"))
         _, silent = await dial(server)
         late = []
         for codec in Codec:
@@ -543,7 +541,7 @@ def test_one_too_many_is_told_in_its_own_codec_until_there_is_a_place() -> None:
             assert [(t.id, t.error.code) for t in told] == [(1, -32003), (2, -32601)]
             assert told[0].error.data == {"allowed": 1}
             late.append((wire, reader, writer))
-        assert app.calls == []
+        assert app.calls == ["session.ping"]
         first.close()
         while server.links:
             await asyncio.sleep(0)
@@ -564,6 +562,9 @@ def test_many_too_many_are_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
 
     async def body(server: TcpServer, app: FakeApp) -> None:
         links = [await dial(server) for _ in range(9)]
+        for reader, writer in links:
+            [answer] = await ask(reader, writer, call("session.ping"))
+            assert "result" in answer
         ends = [asyncio.create_task(reader.read()) for reader, _ in links]
         while sum(end.done() for end in ends) < 5:  # one is served and three wait
             await asyncio.sleep(0.01)

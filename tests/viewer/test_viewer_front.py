@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import gzip
 import json
 import re
@@ -19,9 +18,11 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
+from flexdt.clients.viewer import browser_connections
 from flexdt.clients.viewer import front as module
 from flexdt.clients.viewer.front import Download, Front
 from flexdt.clients.viewer.page import ON_THE_WAY
+from flexdt.runtime import waiting_room
 from flexdt.runtime.access import AccessError, client_tls, server_tls
 
 TOKEN = "a-token-of-sixteen-or-more"
@@ -287,38 +288,67 @@ def test_views_beyond_the_limit_are_refused() -> None:
     asyncio.run(run())
 
 
-def test_connections_beyond_the_limit_are_cut_and_there_is_room_again(
+def test_silent_connections_give_way_to_newcomers_and_pages_stay(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Who connects and says nothing keeps nobody out for long, and is no line of the log."""
-    monkeypatch.setattr(module, "SPARE", 2)
+    """Whatever peers without a request or without the token hold, pages are served."""
+    monkeypatch.setattr(waiting_room, "WAITING", 6)
 
     async def run() -> None:
-        front = Front(echo, nowhere, HTML, {}, max_scenes=1, max_pages=1)
+        front = Front(echo, nowhere, HTML, {}, TOKEN, max_scenes=1, max_pages=1)
         await front.start("127.0.0.1", 0)
-        silent = [await asyncio.open_connection("127.0.0.1", front.port) for _ in range(4)]
-        reader, writer = await asyncio.open_connection("127.0.0.1", front.port)
-        with contextlib.suppress(ConnectionError):
-            assert await asyncio.wait_for(reader.read(), 60) == b""
-        for _, one in (*silent, (reader, writer)):
-            one.close()
-        for _ in range(200):
-            with contextlib.suppress(ConnectionError, ValueError, IndexError):
-                if (await fetch(front.port, "/"))[0] == 200:
-                    break
-            await asyncio.sleep(0.02)
-        else:
-            raise AssertionError("there is no room again")
+        cookie = (await fetch(front.port, f"/?token={TOKEN}"))[1]["Set-Cookie"].split(";")[0]
+        url = f"ws://127.0.0.1:{front.port}/ws/{'b' * 12}"
+        held = []
+        async with connect(url, proxy=None, additional_headers={"Cookie": cookie}) as page:
+            for said in [b"", b"GET / HTTP/1.1\r\n", b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n"] * 30:
+                _, writer = await asyncio.open_connection("127.0.0.1", front.port)
+                writer.write(said)
+                held.append(writer)
+                await page.send("still here")
+                assert await page.recv() == f"{'b' * 12}:still here"
+                assert (await fetch(front.port, "/", Cookie=cookie))[0] == 200
+                assert len(front.admission.strangers.guests) <= 6
+        for writer in held:
+            writer.close()
         await front.close()
+        assert not front.admission.strangers.guests
+        assert not front.admission.answered.guests
 
     asyncio.run(run())
     assert caplog.messages == []
 
 
+def test_answers_that_are_not_read_give_way_to_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A peer that sends whole requests and takes no answer displaces its own alone."""
+    monkeypatch.setattr(browser_connections, "ANSWERED", 3)
+    monkeypatch.setattr(module, "STILL_S", 0.5)
+
+    async def slow(asked: object) -> bytes | None:
+        await asyncio.sleep(60.0)
+        return None
+
+    async def run() -> None:
+        front = Front(echo, nowhere, HTML, {}, still=slow)
+        await front.start("127.0.0.1", 0)
+        held = []
+        for _ in range(12):
+            _, writer = await asyncio.open_connection("127.0.0.1", front.port)
+            writer.write(b"GET /still.jpg HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+            held.append(writer)
+            assert (await fetch(front.port, "/"))[0] == 200
+            assert len(front.admission.answered.guests) <= 3
+        for writer in held:
+            writer.close()
+        await front.close()
+
+    asyncio.run(run())
+
+
 def test_messages_that_never_end_are_cut_and_others_are_heard(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(module, "MAX_HELD", 4 << 20)
+    monkeypatch.setattr(browser_connections, "MAX_HELD", 4 << 20)
 
     async def endless(port: int, number: int) -> None:
         url = f"ws://127.0.0.1:{port}/ws/{number:012x}"

@@ -1,0 +1,94 @@
+"""The connections of browsers to the viewer's front: which of them stay where too many come.
+
+One that has not sent a whole request with the token (without one: a request of the viewer's own
+site) waits in a room; so does, in a second room, a request that is being answered. Pages and views
+have places, which the front counts. `runtime/waiting_room.py` says which connection gives way.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any, Final
+
+from websockets.asyncio.server import ServerConnection
+
+from flexdt.runtime import waiting_room
+from flexdt.runtime.process import tune
+from flexdt.runtime.waiting_room import Room, neighbourhood
+
+ANSWERED: Final = 64
+"""Requests with the token that may be in service at a time, beside pages and views."""
+MAX_HELD: Final = 256 << 20
+"""Bytes of messages that have begun and not ended, of all connections together."""
+FAIR: Final = 1 << 20
+"""A connection that holds no more than this is not cut for what others hold."""
+
+
+class Admission:
+    """Who is connected without a place, and the bytes that all connections hold."""
+
+    def __init__(self) -> None:
+        self.strangers = Room[BrowserConnection](waiting_room.WAITING)
+        self.answered = Room[BrowserConnection](ANSWERED)
+        self.held = 0
+
+    def connection(self, *given: Any, **more: Any) -> BrowserConnection:
+        """What serves one connection, with what websockets gives it."""
+        return BrowserConnection(self, *given, **more)
+
+
+class BrowserConnection(ServerConnection):
+    """A connection that is cut where a newer one needs its room, or where all hold too much."""
+
+    def __init__(self, admission: Admission, *given: Any, **more: Any) -> None:
+        super().__init__(*given, **more)
+        self._admission = admission
+        self._held = 0
+        """Bytes that have come since a message was last taken."""
+        self.address = ""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Wait among those that have said nothing."""
+        super().connection_made(transport)
+        peer = transport.get_extra_info("peername") or ("?", 0)
+        self.address = neighbourhood(str(peer[0]))
+        tune(transport.get_extra_info("socket"))
+        self._admission.strangers.enter(self)
+
+    def admit(self) -> None:
+        """It has sent a request that is answered."""
+        self._admission.strangers.leave(self)
+        self._admission.answered.enter(self)
+
+    def seat(self) -> None:
+        """It has the place of a page or of a view."""
+        self._admission.answered.leave(self)
+
+    def displace(self) -> None:
+        """A newer connection needs the room."""
+        self.transport.abort()
+
+    def data_received(self, data: bytes) -> None:
+        """Take bytes, unless it and all together hold too many."""
+        self._hold(self._held + len(data))
+        if self._admission.held > MAX_HELD and self._held > FAIR:
+            self.transport.abort()
+        else:
+            super().data_received(data)
+
+    async def recv(self, decode: bool | None = None) -> Any:
+        """The next message."""
+        message = await super().recv(decode)
+        self._hold(0)
+        return message
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """It has ended, wherever it was."""
+        self._hold(0)
+        self._admission.strangers.leave(self)
+        self._admission.answered.leave(self)
+        super().connection_lost(exc)
+
+    def _hold(self, size: int) -> None:
+        self._admission.held += size - self._held
+        self._held = size

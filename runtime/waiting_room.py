@@ -1,0 +1,68 @@
+"""Connections without a place, at every port: who stays where too many come.
+
+A connection waits in a `Room` until it has shown what its port wants: the token, or without one a
+request that is served. A newcomer always gets in, so that it can say what it is; what it displaces
+belongs to the address that has most there.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+from collections import Counter
+from typing import Final, Generic, Protocol, TypeVar
+
+WAITING: Final = 512
+"""Connections of a port that may wait: where one address opens 167 a second, each of them still has
+3 s to say what it is."""
+
+
+class Guest(Protocol):
+    """A connection that may be in a room."""
+
+    address: str
+    """Where it comes from, as `neighbourhood` has it."""
+
+    def displace(self) -> None:
+        """Close the connection: a newer one needs the room."""
+
+
+_G = TypeVar("_G", bound=Guest)
+
+
+class Room(Generic[_G]):
+    """Connections without a place, in the order in which they came.
+
+    Where it is full, the oldest connection of the address that has most goes. A newcomer thus
+    always gets in, and an address with many connections displaces its own.
+
+    Args:
+        most: connections.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self.guests: dict[_G, None] = {}
+
+    def enter(self, guest: _G) -> None:
+        """Let a connection in; displaces another one if need be."""
+        self.guests[guest] = None
+        if len(self.guests) > self._most:
+            [(crowd, _)] = Counter(g.address for g in self.guests).most_common(1)
+            oldest = next(g for g in self.guests if g.address == crowd)
+            self.leave(oldest)
+            oldest.displace()
+
+    def leave(self, guest: _G) -> None:
+        """A connection has a place now, or has ended; it need not be here."""
+        self.guests.pop(guest, None)
+
+
+def neighbourhood(host: str) -> str:
+    """The address for a share: an IPv4 address, or the 64 bits of an IPv6 network (one owner's)."""
+    try:
+        address = ipaddress.ip_address(host.partition("%")[0])
+    except ValueError:
+        return host
+    if address.version == 4:
+        return str(address)
+    return str(address.ipv4_mapped or ipaddress.ip_network((address, 64), strict=False))
