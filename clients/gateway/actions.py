@@ -30,6 +30,8 @@ from flexdt.clients.gateway.vocabulary import (
 )
 from flexdt.protocol.state_model import JobStatus, State
 from flexdt.twin.dataset.dataset_errors import DatasetError
+from flexdt.twin.machine.kinematics import motor_targets, virtual_reading
+from flexdt.twin.machine.travel import Rate, arrival, rate
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.grammar import bare_name, image_name
 
@@ -156,7 +158,7 @@ async def move(twin: ConnectedTwin, command: c.MoveAbsolute, progress: CommandPr
 
 
 async def _go(twin: ConnectedTwin, axis: str, target: float, progress: CommandProgress) -> str:
-    await twin.ask("axes.move", {"targets": {axis: target}})
+    await twin.ask("axes.move", {"targets": {axis: await _at_limit_switch(twin, axis, target)}})
     state = await twin.state()
     bound = state.axes[axis].target
     while state.axes[axis].moving and state.axes[axis].target == bound:
@@ -170,6 +172,38 @@ async def _go(twin: ConnectedTwin, axis: str, target: float, progress: CommandPr
             f"or sent elsewhere{_why(state)}"
         )
     return twin.motor_text(axis, at)
+
+
+async def _at_limit_switch(twin: ConnectedTwin, axis: str, target: float) -> float:
+    """The target of a line of a script: a limit, where that is beyond it and the machine clamps."""
+    machine = twin.machine
+    if machine is None or not machine.has(axis):
+        return target
+    axes = (await twin.state()).axes
+    bound = {motor: axes[motor].target for motor in machine.axes}
+    found = arrival(machine, axis, motor_targets(machine, axis, target, bound))
+    if found.beyond is None or not found.is_clamped(machine):
+        return target  # the twin judges it by the same rule
+    if axis in machine.axes:
+        return found.motors[axis]
+    return virtual_reading(machine, axis, {**bound, **found.motors})
+
+
+def rate_setting(what: Rate, digits: int) -> Action:
+    """A command that sets an axis's speed or acceleration, of moves to come."""
+
+    async def send(twin: ConnectedTwin, command: Any, progress: CommandProgress) -> str:
+        axis, machine = command.component, twin.machine
+        value: float = getattr(command, what)
+        if machine is not None and machine.has(axis):
+            found = rate(machine, axis, what, value)
+            shares = machine.moves(axis)
+            if found.told and found.is_clamped(machine):
+                value = min(found.motors[motor] / abs(share) for motor, share in shares.items())
+        await twin.ask("axes.set", {"axis": axis, what: value})
+        return f"{value:.{digits}f}"
+
+    return send
 
 
 def _why(state: State) -> str:
@@ -326,14 +360,8 @@ ACTIONS: Final[Mapping[type[c.Command], Action]] = {
     c.TakeSequence: sequence,
     c.MoveAbsolute: move,
     # Of moves to come; the one under way keeps its own.
-    c.SetSpeed: setting(
-        "axes.set", lambda k: {"axis": k.component, "speed": k.speed}, lambda k: f"{k.speed:.10f}"
-    ),
-    c.SetAcceleration: setting(
-        "axes.set",
-        lambda k: {"axis": k.component, "acceleration": k.acceleration},
-        lambda k: f"{k.acceleration:.6f}",
-    ),
+    c.SetSpeed: rate_setting("speed", 10),
+    c.SetAcceleration: rate_setting("acceleration", 6),
     # Works for anyone, with or without control.
     StopAll: setting("axes.stop", lambda k: {}, lambda k: ""),
     Question: question,

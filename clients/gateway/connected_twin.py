@@ -184,7 +184,7 @@ class ConnectedTwin:
         A virtual axis, which has no motor, and a motor of a machine that the gateway does not know
         reply with their position.
         """
-        machine, _ = self._scanner()
+        machine = self.machine
         known = None if machine is None else machine.axes.get(axis)
         if known is None or at.speed is None or at.acceleration is None:
             return f"{at.position:.10f}"
@@ -193,6 +193,11 @@ class ConnectedTwin:
             known.max_speed, known.max_acceleration,
         )  # fmt: skip
         return motor_cluster(motor).decode("latin-1")
+
+    @property
+    def machine(self) -> Machine | None:
+        """The twin's; None where the gateway does not know it."""
+        return self._scanner()[0]
 
     def _scanner(self) -> tuple[Machine | None, Profile | None]:
         hello, machine = self.link.hello, self._machine

@@ -40,6 +40,24 @@ def test_a_colliding_move_halts_is_counted_and_at_last_needs_a_reset(tmp_path: P
     run(tmp_path, body)
 
 
+def test_a_target_within_the_arrival_tolerance_arrives_at_the_limit_and_is_told(
+    tmp_path: Path,
+) -> None:
+    async def body(lab: Lab) -> None:
+        c = lab.client()
+        await c.call("axes.move", targets={"mag_det": 1058.0}, wait=True)
+        for plan in (False, True):
+            done = await c.call("axes.move", targets={"mag_det": 1060.0}, wait=True, plan=plan)
+            assert done["arrived"] is True
+            assert done["warnings"] == [
+                "mag_det target 1060 mm is outside [100, 1059] mm; set to the limit"
+            ]
+            assert (await c.call("state.get"))["axes"]["mag_det"]["position"] == 1059.0
+        assert (await c.error("axes.move", targets={"mag_det": 1060.1})).code == -32001
+
+    run(tmp_path, body)
+
+
 @pytest.mark.parametrize("command", ["axes.stop", "safety.estop"])
 @pytest.mark.parametrize("plan", [False, True])
 def test_a_waiting_move_is_answered_when_a_stop_has_brought_the_axes_to_rest(

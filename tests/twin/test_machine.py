@@ -27,12 +27,12 @@ from flexdt.twin.machine.description import (
     builtin_machines,
     builtin_profile,
     builtin_profiles,
-    check_target,
     default_profile,
     parse_machine,
 )
 from flexdt.twin.machine.kinematics import places, poses, resolve_targets
 from flexdt.twin.machine.new_machine import Answers, new_machine_text
+from flexdt.twin.machine.travel import check_target
 
 X = {"lower": -5.0, "upper": 5.0, "home": 0.0, "speed": 1.0, "max_speed": 2.0, "acceleration": 1.0,
      "max_acceleration": 2.0}  # fmt: skip

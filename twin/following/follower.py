@@ -245,7 +245,7 @@ class Follower:
         for p in sim.findings.problems:
             if p.code in _OF_ONE_COMMAND and not (mirror.xrays_on is None and "xray" in p.code):
                 kind = _OF_ONE_COMMAND[p.code]
-                mirror = _alarm(mirror, now, "error", kind, about, p.message)
+                mirror = _alarm(mirror, now, p.severity, kind, about, p.message)
         low, high = _bounds(step, self.machine)
         delay = max(0.0, high - step.computed_s)
         for name in moved:

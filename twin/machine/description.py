@@ -687,19 +687,6 @@ def unknown_axis(name: str, machine: Machine) -> UnknownNameError:
     return UnknownNameError.among(f"unknown axis {name!r}; {machine.name} has", name, allowed)
 
 
-def check_target(machine: Machine, axis: str, value: float) -> float:
-    """Return `value` if it lies within the travel limits of motor `axis`.
-
-    Raises:
-        LimitError: says axis, value, unit and limits.
-    """
-    a = machine.axis(axis)
-    if not a.lower <= value <= a.upper:
-        said = f"{axis} target {value:g} {a.unit} is outside [{a.lower:g}, {a.upper:g}] {a.unit}"
-        raise LimitError.of_axis(said, axis, value, [a.lower, a.upper], a.unit)
-    return value
-
-
 def parse_machine(text: str, file: str = "<machine>", corners: Corners | None = None) -> Machine:
     """Read a machine description.
 

@@ -27,7 +27,8 @@ from flexdt.twin.geometry.conventions import (
 )
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.camera import CameraSettings
-from flexdt.twin.machine.description import Machine, Profile, check_target, unknown_axis
+from flexdt.twin.machine.description import Machine, Profile, unknown_axis
+from flexdt.twin.machine.travel import arrival, check_target
 
 _NAMES: Final = {
     "object_y": "SOD",
@@ -134,7 +135,9 @@ def resolve_targets(
     *,
     relative: bool = False,
 ) -> dict[str, float]:
-    """Targets of motors and virtual axes to absolute motor targets, checked against limits.
+    """Targets of motors and virtual axes to absolute motor targets within their travel.
+
+    `twin/machine/travel.py` has the rule for what lies beyond a limit.
 
     Args:
         machine: whose axes these are.
@@ -144,7 +147,7 @@ def resolve_targets(
 
     Raises:
         UnknownNameError: no such axis.
-        LimitError: a motor would leave its travel.
+        LimitError: a motor would leave its travel by more than its tolerance.
 
     Example:
         >>> from flexdt.twin.machine.description import builtin_machine
@@ -154,31 +157,58 @@ def resolve_targets(
     """
     out: dict[str, float] = {}
     for name, value in targets.items():
-        moves = machine.moves(name)
-        if name in machine.axes:  # exactly, and not a sum that rounds to it
-            out[name] = check_target(machine, name, value + positions[name] if relative else value)
-            continue
-        here = virtual_reading(machine, name, positions)
-        step = value if relative else value - here
-        shares = {motor: positions[motor] + factor * step for motor, factor in moves.items()}
-        try:
-            for motor, target in shares.items():
-                check_target(machine, motor, target)
-        except LimitError as error:
-            ends = []
-            for motor, factor in moves.items():
-                axis = machine.axes[motor]
-                left = (axis.lower - positions[motor], axis.upper - positions[motor])
-                ends.append(sorted(here + way / factor for way in left))
-            low, high = max(low for low, _ in ends), min(high for _, high in ends)
-            unit = error.data["unit"]
-            said = (
-                f"{name} target {here + step:g} {unit} is outside [{low:g}, {high:g}] {unit}, "
-                f"which is how far its motors go from here: {error}"
-            )
-            raise LimitError.of_axis(said, name, here + step, [low, high], str(unit)) from None
-        out.update(shares)
+        asked = motor_targets(machine, name, value, positions, relative=relative)
+        found = arrival(machine, name, asked)
+        if found.beyond is not None:
+            raise _too_far(machine, name, value, positions, found.beyond, relative=relative)
+        out.update(found.motors)
     return out
+
+
+def motor_targets(
+    machine: Machine,
+    axis: str,
+    value: float,
+    positions: Mapping[str, float],
+    *,
+    relative: bool = False,
+) -> dict[str, float]:
+    """Motor -> target of a move of `axis`, without limits; arguments as `resolve_targets`.
+
+    Raises:
+        UnknownNameError: no such axis.
+    """
+    moves = machine.moves(axis)
+    if axis in machine.axes:  # exactly, and not a sum that rounds to it
+        return {axis: value + positions[axis] if relative else value}
+    step = value if relative else value - virtual_reading(machine, axis, positions)
+    return {motor: positions[motor] + factor * step for motor, factor in moves.items()}
+
+
+def _too_far(
+    machine: Machine,
+    axis: str,
+    value: float,
+    positions: Mapping[str, float],
+    error: LimitError,
+    *,
+    relative: bool,
+) -> LimitError:
+    """A motor's error, in the words of the axis that was to move."""
+    if axis in machine.axes:
+        return error
+    here, ends = virtual_reading(machine, axis, positions), []
+    for motor, factor in machine.moves(axis).items():
+        a = machine.axes[motor]
+        left = (a.lower - positions[motor], a.upper - positions[motor])
+        ends.append(sorted(here + way / factor for way in left))
+    low, high = max(low for low, _ in ends), min(high for _, high in ends)
+    target, unit = here + value if relative else value, error.data["unit"]
+    said = (
+        f"{axis} target {target:g} {unit} is outside [{low:g}, {high:g}] {unit}, "
+        f"which is how far its motors go from here: {error}"
+    )
+    return LimitError.of_axis(said, axis, target, [low, high], str(unit))
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 from flexdt.twin.machine.description import Machine
+from flexdt.twin.machine.travel import SAME_PLACE
 from flexdt.twin.motion import profiles as motion
-from flexdt.twin.motion.drives import SAME_PLACE, Drive, Drives
+from flexdt.twin.motion.drives import Drive, Drives
 from flexdt.twin.motion.profiles import ROUNDING, Piece, Trajectory
 
 PATH_ERROR = 1e-5

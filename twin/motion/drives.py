@@ -18,11 +18,9 @@ from functools import cached_property
 from flexdt.twin.errors import LimitError
 from flexdt.twin.machine.description import Axis, Machine
 from flexdt.twin.machine.kinematics import resolve_targets
+from flexdt.twin.machine.travel import Rate, rate
 from flexdt.twin.motion import profiles as motion
 from flexdt.twin.motion.profiles import LEAST_RATE, Trajectory
-
-SAME_PLACE = 1e-9
-"""Difference between two positions that is rounding [mm, deg]."""
 
 
 @dataclass(frozen=True)
@@ -212,22 +210,30 @@ def with_settings(
     """
     out = dict(drives)
     shares = {name: abs(factor) for name, factor in machine.moves(axis).items()}
-    for what, value in (("speed", speed), ("acceleration", acceleration)):
-        most = {name: getattr(machine.axes[name], f"max_{what}") for name in shares}
-        if value is None or all(LEAST_RATE <= value * s <= most[n] for n, s in shares.items()):
+    asked: tuple[tuple[Rate, float | None], ...] = (
+        ("speed", speed), ("acceleration", acceleration),
+    )  # fmt: skip
+    for what, value in asked:
+        above = () if value is None else rate(machine, axis, what, value).told
+        if value is None or not (above or any(value * s < LEAST_RATE for s in shares.values())):
             continue
         low = LEAST_RATE / min(shares.values())
-        high = min(most[name] / share for name, share in shares.items())
+        axes = machine.axes
+        high = min(getattr(axes[name], f"max_{what}") / share for name, share in shares.items())
         raise LimitError(
             f"{axis} {what} {value:g} is outside [{low:g}, {high:g}]",
             {"axis": axis, "setting": what, "asked": value, "allowed": [low, high]},
         )
     for name, share in shares.items():
-        drive = drives[name]
+        drive, most = drives[name], machine.axes[name]
         out[name] = replace(
             drive,
-            speed=drive.speed if speed is None else speed * share,
-            acceleration=drive.acceleration if acceleration is None else acceleration * share,
+            speed=drive.speed if speed is None else min(speed * share, most.max_speed),
+            acceleration=(
+                drive.acceleration
+                if acceleration is None
+                else min(acceleration * share, most.max_acceleration)
+            ),
         )
     return out
 

@@ -20,6 +20,7 @@ from typing import Literal
 
 from flexdt.twin.errors import CollisionError, SafetyError
 from flexdt.twin.machine.description import Machine
+from flexdt.twin.machine.travel import SAME_PLACE
 from flexdt.twin.motion import profiles as motion
 from flexdt.twin.motion.braking import (
     Most,
@@ -29,7 +30,7 @@ from flexdt.twin.motion.braking import (
     greatest,
     programme_time_at_rest,
 )
-from flexdt.twin.motion.drives import SAME_PLACE, Drive
+from flexdt.twin.motion.drives import Drive
 from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.scanner.safety import Contact, Guard, floor, would_touch
 from flexdt.twin.scanner.state import NamedCorrection, Sample

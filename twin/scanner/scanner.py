@@ -22,7 +22,13 @@ from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine, Profile
-from flexdt.twin.machine.kinematics import motor_poses, resolve_targets, virtual_reading
+from flexdt.twin.machine.kinematics import (
+    motor_poses,
+    motor_targets,
+    resolve_targets,
+    virtual_reading,
+)
+from flexdt.twin.machine.travel import arrival
 from flexdt.twin.motion import drives as plan
 from flexdt.twin.motion import profiles as motion
 from flexdt.twin.motion.braking import coasting
@@ -262,6 +268,25 @@ class ScannerTwin:
             self.machine, self._drives, targets, now, relative=relative, shortest=shortest
         )
         return {name: t.target for name, t in planned.items()}
+
+    def told_of(
+        self, targets: Mapping[str, float], now: float, *, relative: bool = False
+    ) -> list[str]:
+        """What of a move's targets lies beyond a limit and would arrive at it, in words.
+
+        Raises:
+            UnknownNameError: no such axis.
+        """
+        bound = self.targets(now)
+        found = (
+            arrival(
+                self.machine,
+                axis,
+                motor_targets(self.machine, axis, value, bound, relative=relative),
+            )
+            for axis, value in targets.items()
+        )
+        return [f"{said}; set to the limit" for each in found for said in each.told]
 
     def jog(self, axis: str, velocity: float, lease_s: float, now: float) -> JogMotion:
         """Run `axis` at `velocity` until the lease ends or a limit nears, and brake.

@@ -24,7 +24,8 @@ from flexdt.twin.geometry.conventions import (
     turn_detector,
 )
 from flexdt.twin.machine.camera import CameraSettings
-from flexdt.twin.machine.description import Axis, Machine, Profile, check_target
+from flexdt.twin.machine.description import Axis, Machine, Profile
+from flexdt.twin.machine.travel import check_target
 from flexdt.twin.scanner.state import CameraChange, TubeSettings, changed_camera, changed_tube
 from flexdt.twin.script.motor_targets import QUANTITIES, MotorTargets, beside_beam
 from flexdt.twin.script.planning.planned_images import MARGIN_IMAGES, run_up

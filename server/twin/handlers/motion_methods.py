@@ -25,15 +25,16 @@ async def move(twin: TwinServer, client: Client, params: p.Move) -> p.MoveResult
     if params.plan:
         return await _move_around_obstacles(twin, client, params)
     now = twin.clock.now()
+    told = twin.scanner.told_of(params.targets, now, relative=params.relative)
     with _cancelling_detour(twin):
         durations = twin.scanner.move(
             params.targets, now, relative=params.relative, shortest=params.shortest
         )
-    warnings, arrived = [], None
+    warnings, arrived = told, None
     if params.wait:
         wanted = {m: t for m, t in twin.scanner.targets(now).items() if m in durations}
-        warnings = await _unreached_targets(twin, wanted)
-        arrived = not warnings
+        short = await _unreached_targets(twin, wanted)
+        warnings, arrived = [*told, *short], not short
     seconds = max(durations.values(), default=0.0)
     return p.MoveResult(duration_s=seconds, warnings=warnings, moves=None, arrived=arrived)
 
@@ -66,6 +67,8 @@ def _cancelling_detour(twin: TwinServer) -> Iterator[None]:
 async def _move_around_obstacles(twin: TwinServer, client: Client, params: p.Move) -> p.MoveResult:
     """One free move after the other; an earlier way ends with its present leg."""
     twin.detours.cancel()
+    now = twin.clock.now()
+    told = twin.scanner.told_of(params.targets, now, relative=params.relative)
     way = await twin.detours.plan(
         params.targets, relative=params.relative, shortest=params.shortest
     )
@@ -77,7 +80,7 @@ async def _move_around_obstacles(twin: TwinServer, client: Client, params: p.Mov
             twin.tell("warning", f"the way around ended early: {task.exception()}")
 
     task.add_done_callback(report)
-    warnings, arrived = [*way.warnings], None
+    warnings, arrived = [*told, *way.warnings], None
     moves = [dict(leg) for leg in way.legs]
     if params.wait:
         short = await finished(task)

@@ -209,11 +209,13 @@ def test_an_offset_is_alarmed_with_the_reply_that_shows_it(offset: float) -> Non
 
 def test_what_lies_beyond_a_limit_is_told_when_it_is_sent() -> None:
     beyond = FLEXRAY.axes["tra_obj"].upper + 5.0
-    listener = Listener(follower()).hear(
-        [(3.0, event(1, ("tra_obj", "move absolute", str(beyond))))]
-    )
-    assert listener.errors == [("limit", "tra_obj")]
-    assert listener.alarms[0].at_s == 3.0
+    strict = FLEXRAY.model_copy(update={"on_limit": "reject"})
+    for machine, severity in ((FLEXRAY, "warning"), (strict, "error")):
+        listener = Listener(follower(machine)).hear(
+            [(3.0, event(1, ("tra_obj", "move absolute", str(beyond))))]
+        )
+        told = [(a.kind, a.about, a.severity, a.at_s) for a in listener.alarms]
+        assert ("limit", "tra_obj", severity, 3.0) in told
     near = Listener(follower()).hear(
         [(0.0, event(1, ("tra_obj", "move absolute", str(beyond - 5.1))))]
     )

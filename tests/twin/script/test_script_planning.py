@@ -181,9 +181,13 @@ def test_limits_clamp_with_a_warning_or_reject(flexray: Machine, profile: Profil
     assert "1059" in plan.warnings[0].message
     assert plan.positions(1e6)["mag_det"] == 1059.0
     strict = flexray.model_copy(update={"on_limit": "reject"})
-    plan = plan_script(script, strict, profile)
+    plan = plan_script(script, strict, profile)  # 1 mm beyond is within the arrival tolerance
+    assert codes(plan) == [("warning", "limit_clamped", 2)]
+    beyond = parse_script("mag_det move absolute 1000 ACK\nmag_det move absolute 1060.1 ACK")
+    plan = plan_script(beyond, strict, profile)
     assert codes(plan) == [("error", "limit", 2)]
     assert len(plan.steps) == 2
+    assert codes(plan_script(beyond, flexray, profile)) == [("warning", "limit_clamped", 2)]
 
 
 def test_a_clamped_virtual_axis_keeps_its_motors_in_step(planned: Planner) -> None:

@@ -6,13 +6,12 @@ frozen values of `plan`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine
-from flexdt.twin.machine.kinematics import virtual_reading
+from flexdt.twin.machine.kinematics import motor_targets
 from flexdt.twin.motion import profiles as motion
 from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.script.planning.plan_values import BeamOn, StartState
@@ -97,12 +96,8 @@ class Motors:
 
     def targets(self, axis: str, value: float, time: float) -> dict[str, float]:
         """Motor -> target for a move of a motor or virtual axis; no limits here."""
-        if axis in self.all:
-            return {axis: value}  # exactly, and not a sum that rounds to it
-        virtual = self.machine.virtual_axes[axis]
-        of = {virtual.of: self.all[virtual.of].position(time)}
-        step = value - virtual_reading(self.machine, axis, of)
-        return {m: self.all[m].position(time) + f * step for m, f in virtual.moves.items()}
+        here = {m: self.all[m].position(time) for m in self.machine.moves(axis)}
+        return motor_targets(self.machine, axis, value, here)
 
     def rates(self, axis: str) -> dict[str, tuple[float, float]]:
         """Motor -> (speed, acceleration); motors of a virtual axis keep in step."""
@@ -181,15 +176,3 @@ class PlannedCamera:
     def assume(self, name: str, value: Any) -> None:
         """Put a value in force that the script does not state."""
         self.settings = replace(self.settings, **{name: value})
-
-
-def clamp(machine: Machine, targets: Mapping[str, float], axis: str) -> dict[str, float]:
-    """The targets moved into the travel; motors of a virtual axis give up the same share."""
-    bounded = {
-        m: min(max(t, machine.axes[m].lower), machine.axes[m].upper) for m, t in targets.items()
-    }
-    if axis in machine.axes:
-        return bounded
-    moves = machine.moves(axis)
-    back = max(((targets[m] - bounded[m]) / f for m, f in moves.items()), key=abs, default=0.0)
-    return {m: targets[m] - f * back for m, f in moves.items()}

@@ -11,11 +11,12 @@ from flexdt.twin.machine.description import (
     Profile,
     unknown_axis,
 )
+from flexdt.twin.machine.travel import clamp
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.motor_targets import beside_beam
 from flexdt.twin.script.planning.plan import ScanPlan
 from flexdt.twin.script.planning.plan_values import SampleSize, StartState
-from flexdt.twin.script.planning.planned_scanner import Motors, clamp
+from flexdt.twin.script.planning.planned_scanner import Motors
 from flexdt.twin.script.planning.planner import plan_script
 from flexdt.twin.script.problems import ScriptProblem, in_order
 from flexdt.twin.script.scan_request import REFERENCES

@@ -15,6 +15,7 @@ from typing import Any, Final
 
 from flexdt.twin.errors import LimitError
 from flexdt.twin.machine.description import Machine, unknown_axis
+from flexdt.twin.machine.travel import Arrival, Rate, arrival, rate
 from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.scanner.state import CameraChange, TubeSettings, changed_camera, changed_tube
 from flexdt.twin.script import commands as c
@@ -217,39 +218,37 @@ class Simulation:
     def _set_rate(self, command: c.SetSpeed | c.SetAcceleration) -> planned.Span:
         if not self._axis(command):
             return self.timed("command", note=" (no effect)")
-        what, per = ("speed", "s") if isinstance(command, c.SetSpeed) else ("acceleration", "s2")
-        note = ""
-        for motor, share in self.machine.moves(command.component).items():
-            axis = self.machine.axes[motor]
-            asked, limit = getattr(command, what) * abs(share), getattr(axis, f"max_{what}")
-            unit = f"{axis.unit}/{per}"
-            if asked > limit:
-                self._over(f"{motor} {what} {asked:g} {unit} is above {limit:g} {unit}")
-                note += f" (limited to {motor} {limit:g} {unit})"
-            setattr(self.motors.all[motor], what, min(asked, limit))
+        what: Rate = "speed" if isinstance(command, c.SetSpeed) else "acceleration"
+        asked = getattr(command, what)
+        found = rate(self.machine, command.component, what, asked)
+        note, shares = "", self.machine.moves(command.component)
+        self._tell(found)
+        for motor, value in found.motors.items():
+            setattr(self.motors.all[motor], what, value)
+            if found.told and value < asked * abs(shares[motor]):
+                unit = f"{self.machine.axes[motor].unit}/{'s' if what == 'speed' else 's2'}"
+                note += f" (limited to {motor} {value:g} {unit})"
         return self.timed("set_motor", note=note)
 
-    def _over(self, message: str) -> None:
-        if self.machine.on_limit == "clamp":
-            self.findings.warn("limit_clamped", f"{message}; set to the limit")
-        else:
-            self.findings.error("limit", message)
+    def _tell(self, found: Arrival) -> None:
+        """Note what lies beyond a limit, as `twin/machine/travel.py` judges it."""
+        for message in found.told:
+            if found.is_clamped(self.machine):
+                self.findings.warn("limit_clamped", f"{message}; set to the limit")
+            else:
+                self.findings.error("limit", message)
 
     def _move(self, command: c.MoveAbsolute) -> planned.Span:
         if not self._axis(command):
             return self.timed("command", note=" (no effect)")
         name = command.component
         asked = self.motors.targets(name, command.target, self.now)
-        targets = planned.clamp(self.machine, asked, name)
-        note = ""
+        found = arrival(self.machine, name, asked)
+        targets, note = found.motors, ""
+        self._tell(found)
         for motor, target in targets.items():
-            if target != asked[motor]:
-                a = self.machine.axes[motor]
-                self._over(
-                    f"{motor} target {asked[motor]:g} {a.unit} is outside "
-                    f"[{a.lower:g}, {a.upper:g}] {a.unit}"
-                )
-                note += f" (limited to {motor} {target:g} {a.unit})"
+            if found.told and target != asked[motor]:
+                note += f" (limited to {motor} {target:g} {self.machine.axes[motor].unit})"
         begin = {m: self.motors.all[m].position(self.now) for m in targets}
         made = {
             m: self.motors.all[m].move(targets[m], self.now, *rate)

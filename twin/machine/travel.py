@@ -1,0 +1,116 @@
+"""One rule for what lies beyond a motor's limit, whatever door a command comes through.
+
+A target beyond the travel by rounding alone is the limit. One beyond it by no more than the axis's
+`arrival_tolerance` (the thesis's arrivalThreshold) arrives at the limit, and this is told. For what
+lies farther beyond, the machine's `on_limit` says whether a line of a script goes to the limit, as
+at a limit switch, or is an error; a request by itself is refused, since its sender can be told.
+Motors of a virtual axis give up the same share.
+
+Rates have no tolerance, and otherwise the same rule.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from flexdt.twin.errors import LimitError
+from flexdt.twin.machine.description import Machine
+
+SAME_PLACE: Final = 1e-9
+"""Difference between two positions that is rounding [mm, deg]."""
+Rate = Literal["speed", "acceleration"]
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """Where motors arrive that are sent to targets, or the rates that they get.
+
+    Attributes:
+        motors: motor -> target within its travel [mm, deg], or rate.
+        told: what lies beyond a limit by more than rounding, in words.
+        beyond: one that lies beyond by more than the tolerance, as an error; None: there is none.
+    """
+
+    motors: Mapping[str, float]
+    told: tuple[str, ...] = ()
+    beyond: LimitError | None = None
+
+    def is_clamped(self, machine: Machine) -> bool:
+        """Whether a script's line goes on with `motors`; otherwise it is an error."""
+        return self.beyond is None or machine.on_limit == "clamp"
+
+
+def arrival(machine: Machine, axis: str, targets: Mapping[str, float]) -> Arrival:
+    """The rule for a move of `axis`.
+
+    Args:
+        machine: whose motors these are.
+        axis: motor or virtual axis that is moved.
+        targets: motor -> target as asked [mm, deg].
+    """
+    told, beyond = [], None
+    for motor, target in targets.items():
+        left = _distance_beyond(machine, motor, target)
+        if left <= SAME_PLACE:
+            continue
+        error = _outside(machine, motor, target)
+        told.append(error.message)
+        if not left <= machine.axes[motor].arrival_tolerance + SAME_PLACE:
+            beyond = beyond or error
+    return Arrival(clamp(machine, targets, axis), tuple(told), beyond)
+
+
+def rate(machine: Machine, axis: str, what: Rate, value: float) -> Arrival:
+    """The rule for a speed or acceleration of `axis`, above the most that its motors have."""
+    motors, told, beyond = {}, [], None
+    for motor, share in machine.moves(axis).items():
+        a = machine.axes[motor]
+        asked, most = value * abs(share), a.max_speed if what == "speed" else a.max_acceleration
+        if asked > most * (1.0 + SAME_PLACE):
+            unit = f"{a.unit}/{'s' if what == 'speed' else 's2'}"
+            told.append(f"{motor} {what} {asked:g} {unit} is above {most:g} {unit}")
+            beyond = beyond or LimitError.of_axis(told[-1], motor, asked, most, unit)
+        motors[motor] = min(asked, most)
+    return Arrival(motors, tuple(told), beyond)
+
+
+def check_target(machine: Machine, axis: str, value: float) -> float:
+    """Return `value` if it lies within the travel of motor `axis`; what is beyond by rounding alone
+    is the limit.
+
+    Raises:
+        LimitError: says axis, value, unit and limits.
+    """
+    a = machine.axis(axis)
+    if not _distance_beyond(machine, axis, value) <= SAME_PLACE:
+        raise _outside(machine, axis, value)
+    return min(max(value, a.lower), a.upper)
+
+
+def clamp(machine: Machine, targets: Mapping[str, float], axis: str) -> dict[str, float]:
+    """The targets moved into the travel; motors of a virtual axis give up the same share."""
+    bounded = _bounded(machine, targets)
+    if axis in machine.axes or bounded == targets:
+        return bounded
+    moves = machine.moves(axis)
+    back = max(((targets[m] - bounded[m]) / f for m, f in moves.items()), key=abs, default=0.0)
+    return _bounded(machine, {m: targets[m] - f * back for m, f in moves.items()})
+
+
+def _bounded(machine: Machine, targets: Mapping[str, float]) -> dict[str, float]:
+    axes = machine.axes
+    return {m: min(max(t, axes[m].lower), axes[m].upper) for m, t in targets.items()}
+
+
+def _distance_beyond(machine: Machine, motor: str, target: float) -> float:
+    """How far a target lies beyond the travel [mm, deg]; negative within it."""
+    a = machine.axes[motor]
+    return max(a.lower - target, target - a.upper)
+
+
+def _outside(machine: Machine, motor: str, target: float) -> LimitError:
+    a = machine.axes[motor]
+    said = f"{motor} target {target:g} {a.unit} is outside [{a.lower:g}, {a.upper:g}] {a.unit}"
+    return LimitError.of_axis(said, motor, target, [a.lower, a.upper], a.unit)
