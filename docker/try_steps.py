@@ -131,6 +131,7 @@ def start(name: str, stages: dict[str, list[tuple[str, str]]], place: Place, mor
         "NUMBA_CACHE_DIR": f"{inside}{home}/numba", "PYTHONDONTWRITEBYTECODE": "1",
         "FLEXDT_HEALTH": health,
     }  # fmt: skip
+    env |= dict(rest.split("=", 1) for word, rest in stages[name] if word == "ENV")
     words[0] = f"{inside}/opt/flexdt/bin/{words[0]}"
     process = place.run([*words, *more], home, True, env=env, stdout=subprocess.DEVNULL)
     begun = time.monotonic()
@@ -192,16 +193,14 @@ def main() -> int:
             "twin": (["--port", "56000", "--token-file", secret, "--projector",
                       "127.0.0.1:56001", "--projector-token-file", secret], 9202),
             "viewer": (["--port", "56080", "--twin", "127.0.0.1:56000", "--token-file",
-                        secret], 0),
+                        secret], 9203),
         }  # fmt: skip
         running = []
         try:
             for name in chosen.images or ["projector", "twin", "viewer"]:
                 more, port = extra[name]
-                health = "tcp:56080"
-                if port:
-                    more = [*more, "--http-port", str(port)]
-                    health = f"http://127.0.0.1:{port}/healthz"
+                more = [*more, "--http-port", str(port)]
+                health = f"http://127.0.0.1:{port}/healthz"
                 process, took = start(name, stages, place, more, health)
                 running.append((name, process))
                 who = "as the image's user" if place.is_root or _as_user() else "as this user"
