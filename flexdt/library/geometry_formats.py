@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,21 +25,27 @@ from flexdt.library.datasets.exchange import (
 )
 from flexdt.library.datasets.exchange_formats import OWN_ENDINGS
 from flexdt.twin.errors import GeometryError
+from flexdt.twin.exchange.cil_arrays import ORIGIN, PANEL, POSES, cil_arrays
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
+from flexdt.twin.exchange.leap_arrays import leap_arrays
 from flexdt.twin.exchange.number_tables import (
     TOMOSIPO_NAMES,
     read_json,
     read_tomosipo,
     tomosipo_arrays,
 )
+from flexdt.twin.exchange.tigre_arrays import ANGLES, tigre_arrays
 from flexdt.twin.geometry.cone_vec import ConeVec, Shape2, check_spread
 from flexdt.twin.geometry.conventions import FloatArray, as_numbers
 from flexdt.twin.plausibility import warn_of
 from flexdt.twin.plausibility.scan_geometry import radian_findings
+from flexdt.twin.projection.volume import Grid, Volume
 from flexdt.twin.signatures import File
 
 OWN: Final = OWN_ENDINGS[0]
 """Ending of flexdt's own document."""
+CUBE: Final = 1e-6
+"""Relative difference of a voxel's edges taken for none."""
 
 
 def from_astra(geometry: Any, shape: Shape2 | None) -> ConeVec:
@@ -114,13 +121,84 @@ def from_tomosipo(geometry: Any) -> ConeVec:
 def to_tomosipo(cone_vec: ConeVec) -> Any:
     """See `ConeVec.to_tomosipo`."""
     arrays = tomosipo_arrays(_scan(cone_vec))
+    return _peer("tomosipo", "tomosipo", ".npz").cone_vec(**arrays)
+
+
+def to_cil(cone_vec: ConeVec) -> Any:
+    """See `ConeVec.to_cil`."""
+    arrays = cil_arrays(_scan(cone_vec))
+    framework = _peer("cil.framework", "CIL", ".cil")
+    geometry = framework.AcquisitionGeometry.create_Cone3D_Flex(*(arrays[name] for name in POSES))
+    counts, sizes = (arrays[name].tolist() for name in PANEL[:2])
+    geometry.set_panel(counts, sizes, origin=ORIGIN)
+    return geometry
+
+
+def to_tigre(cone_vec: ConeVec, like: object) -> tuple[Any, FloatArray]:
+    """See `ConeVec.to_tigre`."""
+    arrays = tigre_arrays(_scan(cone_vec))
+    angles = np.asarray(arrays.pop(ANGLES), dtype=np.float64)
+    geometry = _peer("tigre", "TIGRE", ".tigre").geometry(mode="cone")
+    for name, values in arrays.items():
+        setattr(geometry, name, values)
+    if like is not None:
+        blank = _voxels(like)
+        edges = np.array(blank.voxel_xyz[::-1])
+        geometry.nVoxel, geometry.dVoxel = np.array(blank.shape), edges
+        geometry.sVoxel = geometry.nVoxel * edges
+        # TIGRE moves the volume; a scan that moves it by itself does so in every view.
+        geometry.offOrigin = geometry.offOrigin + np.array(blank.center_mm[::-1])
+    return geometry, angles
+
+
+def to_leap(cone_vec: ConeVec, like: object, rows_up: bool) -> Any:
+    """See `ConeVec.to_leap`."""
+    scan = _scan(cone_vec)
+    arrays = leap_arrays(scan.rows_up() if rows_up else scan)
+    model = _peer("leapctype", "LEAP", ".leap").tomographicModels()
+    *numbers, a, b, c, d = arrays.values()
+    poses = (np.ascontiguousarray(part, dtype=np.float32) for part in (a, b, c, d))
+    if not model.set_modularbeam(*(number.item() for number in numbers), *poses):
+        raise ExchangeError("LEAP refuses the geometry; it has printed why")
+    if like is None:
+        model.set_default_volume()
+        return model
+    blank = _voxels(like)
+    x, y, z = blank.voxel_xyz
+    if max(x, y, z) - min(x, y, z) > CUBE * x:
+        asked = f"LEAP: voxels of {x:g} x {y:g} x {z:g} mm"
+        raise ExchangeError.instead(asked, [x, y, z], "cubes, in a modular beam")
+    if not model.set_volume(*blank.shape[::-1], x, z, *blank.center_mm):
+        raise ExchangeError("LEAP refuses the volume; it has printed why")
+    return model
+
+
+def _voxels(like: object) -> Volume:
+    """The volume, or one of zeros on the grid.
+
+    Raises:
+        GeometryError: neither.
+    """
+    if isinstance(like, Volume):
+        return like
+    if isinstance(like, Grid):
+        return like.blank()
+    kind = type(like).__name__
+    raise GeometryError.instead(f"like: a {kind}", kind, "a Grid or a Volume")
+
+
+def _peer(module: str, name: str, ending: str) -> Any:
+    """Another program's module.
+
+    Raises:
+        ExchangeError: it cannot be imported; says which file it reads.
+    """
     try:
-        import tomosipo
-    except ImportError as error:
+        return import_module(module)
+    except (ImportError, OSError) as error:
         raise ExchangeError(
-            f"tomosipo is not installed ({error}); a file for it: geometry.save('FILE.npz')"
+            f"{name} cannot be imported ({error}); a file for it: geometry.save('FILE{ending}')"
         ) from None
-    return tomosipo.cone_vec(**arrays)
 
 
 def load(

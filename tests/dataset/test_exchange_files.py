@@ -89,7 +89,7 @@ def test_the_tables_of_before_are_deprecated(folder: Path, tmp_path: Path) -> No
         _ = exchange.READERS
 
 
-@pytest.mark.parametrize("format", ["rtk", "astra", "csv", "tomosipo"])
+@pytest.mark.parametrize("format", ["rtk", "astra", "csv", "tomosipo", "cil", "tigre", "leap"])
 def test_images_upside_down(format: str, folder: Path, tmp_path: Path, flexdt: Run) -> None:
     up, back = tmp_path / f"up.{ENDINGS[format]}", tmp_path / "back.npy"
     words = ("--format", format, "--rows", "up")

@@ -214,15 +214,15 @@ def folder(record: Callable[..., ScanRecord], written: Callable[..., Path]) -> P
     return written(record(frames=4))
 
 
-def _write_leap(scan: ScanGeometry, out: Path) -> str:
+def _write_mango(scan: ScanGeometry, out: Path) -> str:
     return json.dumps(scan.cone_vec.rows.tolist())
 
 
-def _read_leap(path: Path, given: object) -> ScanGeometry:
+def _read_mango(path: Path, given: object) -> ScanGeometry:
     return ScanGeometry(fx.ConeVec(json.loads(path.read_text())))
 
 
-LEAP = geometry.Format("leap", (".leap",), _write_leap, read=_read_leap)
+MANGO = geometry.Format("mango", (".mango",), _write_mango, read=_read_mango)
 
 
 def completions(words: str, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> set[str]:
@@ -239,15 +239,15 @@ def completions(words: str, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> set
 def test_a_format_of_geometry_that_is_added_is_at_every_door(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:
-    monkeypatch.setitem(geometry.FORMATS, LEAP.name, LEAP)  # type: ignore[arg-type]
-    file, back = tmp_path / "g.leap", tmp_path / "back.json"
+    monkeypatch.setitem(geometry.FORMATS, MANGO.name, MANGO)  # type: ignore[arg-type]
+    file, back = tmp_path / "g.mango", tmp_path / "back.json"
     rows = load_dataset(folder).geometry.rows
     # The library.
-    export_dataset(load_dataset(folder), file, "leap")
-    assert np.array_equal(import_geometry(file, "leap").cone_vec.rows, rows)
-    fx.ConeVec.load(file).save(tmp_path / "again.leap")
-    fx.ConeVec.load(file).save(tmp_path / "again.leap", format="leap")
-    assert np.array_equal(fx.ConeVec.load(tmp_path / "again.leap").rows, rows)
+    export_dataset(load_dataset(folder), file, "mango")
+    assert np.array_equal(import_geometry(file, "mango").cone_vec.rows, rows)
+    fx.ConeVec.load(file).save(tmp_path / "again.mango")
+    fx.ConeVec.load(file).save(tmp_path / "again.mango", format="mango")
+    assert np.array_equal(fx.ConeVec.load(tmp_path / "again.mango").rows, rows)
     # Errors.
     scan = fx.ConeVec.load(file)
     for wrong in (
@@ -256,23 +256,23 @@ def test_a_format_of_geometry_that_is_added_is_at_every_door(
         lambda: scan.save(tmp_path / "g.none"),
         lambda: fx.ConeVec.load(tmp_path / "g.none"),
     ):
-        with pytest.raises(ExchangeError, match=r"csv.*leap"):
+        with pytest.raises(ExchangeError, match=r"csv.*mango"):
             wrong()
-    with pytest.raises(ExchangeError, match=r"ends with \.leap"):
-        export_dataset(load_dataset(folder), tmp_path / "g.csv", "leap")
+    with pytest.raises(ExchangeError, match=r"ends with \.mango"):
+        export_dataset(load_dataset(folder), tmp_path / "g.csv", "mango")
     # The command line.
     file.unlink()
-    assert run(["export", str(folder), "--format", "leap", "--out", str(file)]) == 0
-    assert run(["import", str(file), "--format", "leap", "--out", str(back)]) == 0
+    assert run(["export", str(folder), "--format", "mango", "--out", str(file)]) == 0
+    assert run(["import", str(file), "--format", "mango", "--out", str(back)]) == 0
     assert np.array_equal(fx.ConeVec.load(back).rows, rows)
     for command in ("export", "import"):
         capsys.readouterr()
         assert run([command, str(file), "--format", "none", "--out", str(back)]) == 2
-        assert "leap" in capsys.readouterr().err
+        assert "mango" in capsys.readouterr().err
         assert run([command, "--help"]) == 0
-        assert "leap" in capsys.readouterr().out
-        found = completions(f"flexdt {command} --format le", monkeypatch, capsys)
-        assert found == {"leap"}
+        assert "mango" in capsys.readouterr().out
+        found = completions(f"flexdt {command} --format ma", monkeypatch, capsys)
+        assert found == {"mango"}
     # Pages and docstrings.
     assert all(differs() for differs in GEOMETRY)
 
@@ -281,8 +281,8 @@ def test_a_format_that_is_only_read_or_only_written_is_at_those_doors_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, form in (
-        ("wo", geometry.Format("wo", (".wo",), _write_leap)),
-        ("ro", geometry.Format("ro", (".ro",), read=_read_leap)),
+        ("wo", geometry.Format("wo", (".wo",), _write_mango)),
+        ("ro", geometry.Format("ro", (".ro",), read=_read_mango)),
     ):
         monkeypatch.setitem(geometry.FORMATS, name, form)  # type: ignore[arg-type]
     scan = fx.ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(7, 9), pixel=0.15)

@@ -16,6 +16,9 @@ CLIENTS = ("AsyncTwinClient", "TwinClient", "LocalTwin")
 """Need a running twin: see tests/clients/test_method_examples.py."""
 WITHOUT = {
     "ConeVec.to_tomosipo": "tomosipo is not a test's dependency",
+    "ConeVec.to_cil": "nor is CIL, which has no wheels",
+    "ConeVec.to_leap": "nor is LEAP",
+    "ConeVec.to_tigre": "nor is TIGRE",
     "Operator.cil": "nor is CIL",
     "Operator.odl": "nor is ODL",
     "Operator.torch": "nor is PyTorch",

@@ -262,6 +262,44 @@ class ConeVec:
         """tomosipo's `ts.cone_vec` geometry, which needs tomosipo and the detector's shape."""
         return _formats().to_tomosipo(self)
 
+    def to_cil(self) -> Any:
+        """CIL's `AcquisitionGeometry` with a pose a view (`create_Cone3D_Flex`), for images as they
+        are, (views, rows, columns); needs CIL 24.3 or newer and the detector's shape.
+
+        Raises:
+            TwinError: skew pixels, several pixel sizes, no shape; CIL is not installed.
+        """
+        return _formats().to_cil(self)
+
+    def to_tigre(self, like: Any = None) -> tuple[Any, FloatArray]:
+        """TIGRE's geometry and its angles [rad], for images as they are, (views, rows, columns);
+        needs TIGRE and the detector's shape.
+
+        Args:
+            like: a `Grid` or `Volume` whose voxels TIGRE takes; None leaves nVoxel, dVoxel and
+                sVoxel to you.
+
+        Raises:
+            TwinError: skew pixels, several pixel sizes, no shape, a panel that lies flat, an object
+                that is not between source and panel; TIGRE is not installed.
+        """
+        found: tuple[Any, FloatArray] = _formats().to_tigre(self, like)
+        return found
+
+    def to_leap(self, like: Any = None, *, rows_up: bool = False) -> Any:
+        """LEAP's model with this scan as its modular beam; needs LEAP and the detector's shape.
+
+        Args:
+            like: a `Grid` or `Volume` whose voxels LEAP takes; None is LEAP's own choice.
+            rows_up: for images turned upside down, `images[:, ::-1]`, which LEAP's filtered
+                backprojection needs; its iterative methods take images as they are.
+
+        Raises:
+            TwinError: skew pixels, several pixel sizes, no shape, voxels that are no cubes; LEAP
+                is not installed, or refuses the geometry.
+        """
+        return _formats().to_leap(self, like, rows_up)
+
     @classmethod
     def from_rtk(
         cls, file: File, *, pixel: float | Sequence[float], shape: Shape2 | None = None
@@ -317,9 +355,9 @@ class ConeVec:
 
         Args:
             file: the path; its ending says the format, where `format` does not: .json (flexdt or
-                CTSimU), .npy, .txt (ASTRA's vectors), .npz (tomosipo), .csv, .xml (RTK), .toml
-                (flexDATA).
-            format: ctsimu, rtk, astra, tomosipo, flexdata or csv.
+                CTSimU), .npy, .txt (ASTRA's vectors), .npz (tomosipo), .cil, .tigre, .leap,
+                .csv, .xml (RTK), .toml (flexDATA).
+            format: ctsimu, rtk, astra, tomosipo, cil, tigre, leap, flexdata or csv.
             shape: detector (rows, cols), where the file does not say.
             pixel: pitch of the pixels [mm], where the file does not say.
 

@@ -11,7 +11,7 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 if TYPE_CHECKING:
     from flexdt.library.datasets.geometry_content import Given
@@ -121,13 +121,9 @@ def _read_astra(path: Path, given: Given) -> ScanGeometry:
 
 
 def _write_tomosipo(geometry: ScanGeometry, out: Path) -> Content:
-    import numpy as np
-
     from flexdt.twin.exchange.number_tables import tomosipo_arrays
 
-    buffer = io.BytesIO()
-    np.savez(buffer, **tomosipo_arrays(geometry))  # type: ignore[arg-type]
-    return buffer.getvalue()
+    return _array_file(tomosipo_arrays(geometry))
 
 
 def _read_tomosipo(path: Path, given: Given) -> ScanGeometry:
@@ -135,6 +131,54 @@ def _read_tomosipo(path: Path, given: Given) -> ScanGeometry:
     from flexdt.twin.exchange.number_tables import read_tomosipo
 
     return read_tomosipo(arrays_of(path), str(path))
+
+
+def _array_file(arrays: Mapping[str, Any]) -> bytes:
+    """The bytes of an .npz."""
+    import numpy as np
+
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, **arrays)
+    return buffer.getvalue()
+
+
+def _write_cil(geometry: ScanGeometry, out: Path) -> Content:
+    from flexdt.twin.exchange.cil_arrays import cil_arrays
+
+    return _array_file(cil_arrays(geometry))
+
+
+def _read_cil(path: Path, given: Given) -> ScanGeometry:
+    from flexdt.library.datasets.geometry_content import arrays_of
+    from flexdt.twin.exchange.cil_arrays import read_cil
+
+    return read_cil(arrays_of(path), str(path))
+
+
+def _write_tigre(geometry: ScanGeometry, out: Path) -> Content:
+    from flexdt.twin.exchange.tigre_arrays import tigre_arrays
+
+    return _array_file(tigre_arrays(geometry))
+
+
+def _read_tigre(path: Path, given: Given) -> ScanGeometry:
+    from flexdt.library.datasets.geometry_content import arrays_of
+    from flexdt.twin.exchange.tigre_arrays import read_tigre
+
+    return read_tigre(arrays_of(path), str(path))
+
+
+def _write_leap(geometry: ScanGeometry, out: Path) -> Content:
+    from flexdt.twin.exchange.leap_arrays import leap_arrays
+
+    return _array_file(leap_arrays(geometry))
+
+
+def _read_leap(path: Path, given: Given) -> ScanGeometry:
+    from flexdt.library.datasets.geometry_content import arrays_of
+    from flexdt.twin.exchange.leap_arrays import read_leap
+
+    return read_leap(arrays_of(path), str(path))
 
 
 def _write_flexdata(geometry: ScanGeometry, out: Path) -> Content:
@@ -186,6 +230,9 @@ FORMATS: Final[Mapping[str, Format]] = {
         Format("rtk", (".xml", ".rtk"), _write_rtk, read=_read_rtk),
         Format("astra", (NPY, ".txt", ".geom", ".dat"), _write_astra, read=_read_astra),
         Format("tomosipo", (".npz",), _write_tomosipo, read=_read_tomosipo),
+        Format("cil", (".cil",), _write_cil, read=_read_cil),
+        Format("tigre", (".tigre",), _write_tigre, read=_read_tigre),
+        Format("leap", (".leap",), _write_leap, read=_read_leap),
         Format("flexdata", (".toml",), _write_flexdata, read=_read_flexdata, rows="up"),
         Format("csv", (".csv",), _write_csv, read=_read_csv),
         Format("nxtomo", (".nxs", ".nx", ".h5", ".hdf5"), export=_export_nxtomo, rows="down"),

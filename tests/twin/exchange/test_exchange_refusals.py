@@ -11,8 +11,11 @@ from hypothesis import strategies as st
 from random_scans import SHAPE, some_poses, worst
 
 from flexdt.twin.errors import GeometryError
+from flexdt.twin.exchange.cil_arrays import PANEL, POSES, read_cil
 from flexdt.twin.exchange.flexdata import flexdata_text, read_flexdata
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
+from flexdt.twin.exchange.leap_arrays import NAMES as LEAP_NAMES
+from flexdt.twin.exchange.leap_arrays import read_leap
 from flexdt.twin.exchange.number_tables import (
     read_csv,
     read_geometry_text,
@@ -22,9 +25,12 @@ from flexdt.twin.exchange.number_tables import (
     tomosipo_arrays,
 )
 from flexdt.twin.exchange.rtk_xml import read_rtk, rtk_text
+from flexdt.twin.exchange.tigre_arrays import ANGLES, PER_VIEW, read_tigre
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.poses import Poses
 
+CIL_NAMES = (*POSES, *PANEL)
+TIGRE_NAMES = (*PER_VIEW, "nDetector", "dDetector", ANGLES)
 RNG = np.random.default_rng(1)
 STILL = ScanGeometry(some_poses(RNG).cone_vec(), SHAPE)
 
@@ -181,3 +187,17 @@ def test_noise_is_refused(text: str) -> None:
             read(text)
     with pytest.raises(ExchangeError):
         read_rtk(text, (1.0, 1.0))
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.dictionaries(
+    st.sampled_from([*TIGRE_NAMES, *CIL_NAMES, *LEAP_NAMES]),
+    st.one_of(st.floats(), st.integers(-2, 9), st.text(max_size=3),
+              st.lists(st.floats(-9, 9), max_size=6),
+              st.lists(st.lists(st.floats(-9, 9), min_size=3, max_size=3), max_size=3)),
+))  # fmt: skip
+def test_noise_in_arrays_is_refused(values: dict[str, Any]) -> None:
+    arrays = {name: np.asarray(value) for name, value in values.items()}
+    for read in (read_cil, read_tigre, read_leap):
+        with pytest.raises(ExchangeError):
+            read(arrays)

@@ -1,0 +1,159 @@
+"""TIGRE's cone geometry: the attributes of its `Geometry`, with an offset a view where it varies,
+and the angles (compared with the source of version 3.1.3, commit e702473).
+
+TIGRE's frame is ours. At angle a its source stands at DSO (cos a, sin a, 0), a panel without offset
+opposite; u points to +y and the rows grow upwards at a = 0. So its angle is ours less 90 deg, and
+the rows of a panel that grow downwards are a pitch of 180 deg. `offOrigin` moves source and panel
+together, `offDetector` the panel in its plane before it turns, and `rotDetector` (about x, y and z,
+the turn about z last) turns it about its centre. The angle is that of the panel's normal, so that
+TIGRE's weights of FDK, which know DSO, DSD and offDetector but no turned panel, are those of the
+real one but for pitch and roll. An attribute that is the same in all views is written once.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry, require_each, require_panel
+from flexdt.twin.exchange.number_tables import cone_vec_of
+from flexdt.twin.exchange.view_arrays import (
+    SPACE,
+    Arrays,
+    counts_of,
+    numbers_of,
+    require_names,
+    require_shape,
+    sizes_of,
+    views_of,
+)
+from flexdt.twin.geometry.conventions import FloatArray, rotation_z
+
+STILL: Final = 1e-11
+"""What an attribute may change by between views [mm, rad] and still be written once: a hundredth
+of what a format may lose."""
+UPRIGHT: Final = 1e-6
+"""Smallest part of the panel's normal that lies level, from which on its angle is determined."""
+PER_VIEW: Final = {"DSO": 0, "DSD": 0, "offOrigin": 3, "offDetector": 2, "rotDetector": 3}
+"""Attributes with a value a view -> numbers of one; 0: a number. Lengths [mm], turns [rad]."""
+PANEL: Final = ("nDetector", "dDetector", "sDetector")
+"""Counts and sizes; those along rows' direction (v) come first, as z does in offOrigin."""
+ANGLES: Final = "angles"
+
+
+def tigre_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
+    """The attributes by name, and `angles` [rad].
+
+    Raises:
+        ExchangeError: skew pixels, several pixel sizes, no shape; a panel that lies flat; an
+            object's origin that is not between source and panel.
+    """
+    rows, columns = require_shape(geometry, "TIGRE")
+    pitch_u, pitch_v = require_panel(geometry.cone_vec, "TIGRE")
+    c = geometry.cone_vec
+    u, v = c.u / pitch_u, c.v / pitch_v
+    right_handed = np.cross(u, v)
+    apart = c.source - c.detector
+    normal = right_handed * np.sign(np.einsum("ni,ni->n", right_handed, apart))[:, None]
+    level = np.hypot(normal[:, 0], normal[:, 1])
+    what = "TIGRE knows panels that do not lie flat; the sine of their normal to the xy plane"
+    require_each(what, np.sqrt(np.maximum(1.0 - level**2, 0.0)), 1.0 - UPRIGHT)
+    angles = np.unwrap(np.arctan2(normal[:, 1], normal[:, 0]))
+    back = rotation_z(-angles)
+    source, apart, u, v = (np.einsum("nij,nj->ni", back, p) for p in (c.source, apart, u, v))
+    what = "TIGRE knows sources before the object's origin; the distance [mm] that it is behind"
+    require_each(what, -source[:, 0], 0.0)
+    what = "TIGRE knows panels behind the source; the distance [mm] before it"
+    require_each(what, -apart[:, 0], 0.0)
+    aside = np.column_stack([np.zeros(len(c)), source[:, 1], source[:, 2]])
+    moved = -np.einsum("nij,nj->ni", rotation_z(angles), aside)
+    per_view = {
+        "DSO": source[:, 0],
+        "DSD": apart[:, 0],
+        "offOrigin": moved[:, ::-1],
+        "offDetector": -apart[:, :0:-1],
+        "rotDetector": _turns(np.stack([np.cross(u, v), u, v], axis=2)),
+    }
+    counts, pitch = np.array([rows, columns]), np.array([pitch_v, pitch_u])
+    panel = dict(zip(PANEL, (counts, pitch, counts * pitch), strict=True))
+    return {**{name: _once(x) for name, x in per_view.items()}, **panel, ANGLES: angles}
+
+
+def _once(values: FloatArray) -> FloatArray:
+    """A value a view, or the one of all views."""
+    still = np.ptp(values, axis=0).max() <= STILL
+    one: FloatArray = values[:1] if values.ndim == 1 else values[0]
+    return np.ascontiguousarray(one if still else values) + 0.0
+
+
+def _turns(axes: FloatArray) -> FloatArray:
+    """Turns (n, 3) about x, y and z [rad] whose product, Rz Ry Rx, is `axes` (n, 3, 3).
+
+    Two triples give the same product; the one whose turns about x and z are small is taken.
+    """
+    pitch = np.arcsin(np.clip(-axes[:, 2, 0], -1.0, 1.0))
+    yaw = np.arctan2(axes[:, 2, 1], axes[:, 2, 2])
+    roll = np.arctan2(axes[:, 1, 0], axes[:, 0, 0])
+    first = np.column_stack([yaw, pitch, roll])
+    other = np.column_stack([yaw + np.pi, np.pi - pitch, roll + np.pi])
+    both = np.stack([first, other])
+    whole = both - 2.0 * np.pi * np.round(both / (2.0 * np.pi))
+    nearer = np.abs(whole[:, :, [0, 2]]).sum(axis=2).argmin(axis=0)
+    found: FloatArray = whole[nearer, np.arange(len(axes))]
+    # Half a turn either way is one pose; all views of a scan have the same sign.
+    return np.where(np.isclose(found, -np.pi, rtol=0.0, atol=STILL), found + 2.0 * np.pi, found)
+
+
+def read_tigre(arrays: Arrays, file: str = "<npz>") -> ScanGeometry:
+    """The geometry of these attributes and angles.
+
+    Raises:
+        ExchangeError: one is missing, or does not hold; a centre of rotation (COR) besides.
+    """
+    require_names(arrays, (*PER_VIEW, "nDetector", "dDetector", ANGLES), file)
+    if "COR" in arrays and np.any(arrays["COR"]):
+        raise ExchangeError.instead(f"{file}: COR is not zero", "COR", "offOrigin", path="COR")
+    views = views_of(arrays, ANGLES, file)
+    angles = numbers_of(arrays, ANGLES, file, (views,))
+    dso, dsd, off_origin, off_detector, turned = (
+        _each(arrays, name, size, file, views) for name, size in PER_VIEW.items()
+    )
+    rows, columns = counts_of(arrays, "nDetector", file, (2,))
+    pitch_v, pitch_u = sizes_of(arrays, "dDetector", file, (2,))
+    axes = _axes(turned)
+    source = np.column_stack([dso, np.zeros(views), np.zeros(views)])
+    detector = np.column_stack([dso - dsd, off_detector[:, ::-1]])
+    turn = rotation_z(angles)
+    placed = [source, detector, pitch_u * axes[:, :, 1], pitch_v * axes[:, :, 2]]
+    parts = [np.einsum("nij,nj->ni", turn, part) for part in placed]
+    for place in parts[:2]:
+        place -= off_origin[:, ::-1]
+    return ScanGeometry(cone_vec_of(np.concatenate(parts, axis=1), file), (rows, columns))
+
+
+def _each(arrays: Arrays, name: str, size: int, file: str, views: int) -> FloatArray:
+    """The value of every view, of an array that holds one or all."""
+    own: tuple[int, ...] = (size,) if size else ()
+    single: tuple[int, ...] = (size,) if size else (1,)
+    if np.shape(arrays[name]) == single:
+        return np.broadcast_to(numbers_of(arrays, name, file, single), (views, *own))
+    return numbers_of(arrays, name, file, (views, *own))
+
+
+def _axes(turns: FloatArray) -> FloatArray:
+    """Rz Ry Rx (n, 3, 3) of turns about x, y and z (n, 3) [rad]."""
+    yaw, pitch, roll = turns.T
+    one, zero = np.ones_like(yaw), np.zeros_like(yaw)
+    about_x = _stacked(one, zero, zero, zero, np.cos(yaw), -np.sin(yaw), zero, np.sin(yaw),
+                       np.cos(yaw))  # fmt: skip
+    about_y = _stacked(np.cos(pitch), zero, np.sin(pitch), zero, one, zero, -np.sin(pitch), zero,
+                       np.cos(pitch))  # fmt: skip
+    product: FloatArray = rotation_z(roll) @ about_y @ about_x
+    return product
+
+
+def _stacked(*entries: FloatArray) -> FloatArray:
+    """Matrices (n, 3, 3) of nine entries (n,), row by row."""
+    return np.stack(entries, axis=1).reshape(-1, SPACE, SPACE)

@@ -1,0 +1,115 @@
+"""Named arrays of a geometry, as other programs take them: what the readers of such files check."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
+from flexdt.twin.geometry.conventions import FloatArray
+
+Arrays = Mapping[str, npt.NDArray[np.generic]]
+SPACE: Final = 3
+"""Numbers of a place or a direction."""
+
+
+def require_shape(geometry: ScanGeometry, format_name: str) -> tuple[int, int]:
+    """The detector's (rows, cols).
+
+    Raises:
+        ExchangeError: they are unknown.
+    """
+    if geometry.shape is None:
+        raise ExchangeError(f"{format_name} needs the detector's shape, which is unknown")
+    return geometry.shape
+
+
+def require_names(arrays: Arrays, names: Sequence[str], file: str) -> None:
+    """Check that each array is there.
+
+    Raises:
+        ExchangeError: names those that are missing.
+    """
+    lost = [name for name in names if name not in arrays]
+    if lost:
+        said = f"{file} lacks {', '.join(lost)}"
+        raise ExchangeError.instead(said, sorted(arrays), tuple(names), missing=lost)
+
+
+def views_of(arrays: Arrays, name: str, file: str) -> int:
+    """Number of views of one array, (n, ...).
+
+    Raises:
+        ExchangeError: it has none.
+    """
+    shape = np.shape(arrays[name])
+    if not shape or not shape[0]:
+        raise ExchangeError.of_shape(f"{file}: {name}", shape, ("n", "..."))
+    return int(shape[0])
+
+
+def vectors_of(arrays: Arrays, names: Sequence[str], file: str) -> list[FloatArray]:
+    """Arrays (n, 3) of the same n.
+
+    Raises:
+        ExchangeError: one has another shape, or holds no numbers.
+    """
+    count = views_of(arrays, names[0], file)
+    return [numbers_of(arrays, name, file, (count, SPACE)) for name in names]
+
+
+def numbers_of(arrays: Arrays, name: str, file: str, shape: tuple[int, ...]) -> FloatArray:
+    """One array of finite numbers.
+
+    Raises:
+        ExchangeError: it has another shape, or holds something else.
+    """
+    array = np.asarray(arrays[name])
+    if array.dtype.kind not in "iuf" or array.shape != shape:
+        raise ExchangeError.of_shape(f"{file}: {name}", array.shape, shape, ", numbers")
+    found = array.astype(np.float64)
+    if not np.isfinite(found).all():
+        raise ExchangeError(f"{file}: {name} holds a number that is not finite", {"path": name})
+    return found
+
+
+def counts_of(arrays: Arrays, name: str, file: str, shape: tuple[int, ...]) -> tuple[int, ...]:
+    """One array of whole numbers above 0.
+
+    Raises:
+        ExchangeError: it holds something else.
+    """
+    found = numbers_of(arrays, name, file, shape).ravel()
+    if (found < 1).any() or (found % 1 != 0).any():
+        raise ExchangeError.instead(f"{file}: {name}", found.tolist(), "whole numbers above 0")
+    return tuple(int(count) for count in found)
+
+
+def sizes_of(arrays: Arrays, name: str, file: str, shape: tuple[int, ...]) -> FloatArray:
+    """One array of numbers above 0.
+
+    Raises:
+        ExchangeError: it holds something else.
+    """
+    found = numbers_of(arrays, name, file, shape)
+    if (found <= 0.0).any():
+        raise ExchangeError.instead(f"{file}: {name}", found.tolist(), "above 0")
+    return found
+
+
+def directions_of(arrays: Arrays, name: str, file: str, count: int) -> FloatArray:
+    """An array (count, 3) of unit vectors; others are normalised.
+
+    Raises:
+        ExchangeError: it holds something else, or a vector of no length.
+    """
+    found = numbers_of(arrays, name, file, (count, SPACE))
+    lengths = np.linalg.norm(found, axis=1, keepdims=True)
+    if (lengths == 0.0).any():
+        view = int(np.argmin(lengths))
+        raise ExchangeError(f"{file}: {name} has no direction in view {view}", {"row": view})
+    unit: FloatArray = found / lengths
+    return unit
