@@ -211,6 +211,9 @@ class State(Result):
     """who may move; None: nobody holds control"""
     image: ImageFlags | None = None
     """the image made last, by anyone's request or by a scan"""
+    unsaved: str | None = None
+    """why this state is not on the server's disk, as after an E-stop on a disk that fails: a server
+    that is killed now comes back without it; null where it is, or is being written"""
 
 
 class Stopping(Result):

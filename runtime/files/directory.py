@@ -45,6 +45,7 @@ _DIRECTORY: Final = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O
 _NO_FOLLOW: Final = getattr(os, "O_NOFOLLOW", 0)
 _BINARY: Final = getattr(os, "O_BINARY", 0)
 _READ: Final = os.O_RDONLY | _NO_FOLLOW | _BINARY | getattr(os, "O_NONBLOCK", 0)
+_WRITE: Final = os.O_RDWR | _NO_FOLLOW | _BINARY
 _NEW: Final = os.O_RDWR | os.O_CREAT | os.O_EXCL | _NO_FOLLOW | _BINARY
 _NUMBERS: Final = itertools.count()
 
@@ -172,6 +173,45 @@ class Directory:
         self.make()
         self.put(name, data)
         self.sync()
+
+    def overwrite(self, name: str, data: bytes) -> None:
+        """Write a file in place from its beginning, and flush it; its size stays, or grows.
+
+        Raises:
+            OSError: there is no such regular file, or the system refuses.
+        """
+        with self._opened() as fd:
+            file = os.open(self._at(name), _WRITE, dir_fd=fd)
+        try:
+            if not stat.S_ISREG(os.fstat(file).st_mode):
+                raise OSError(errno.EINVAL, "it is no regular file", str(self.path / name))
+            left = memoryview(data)
+            while left.nbytes:
+                left = left[self._write(file, left) :]
+            os.fsync(file)
+        finally:
+            os.close(file)
+
+    def allocate(self, name: str, size: int) -> None:
+        """Make a file of `size` bytes that have their place on the disk, instead of its namesake.
+
+        Raises:
+            OSError: the system refuses, as for want of room; then there is no such file.
+        """
+        with self._opened() as fd:
+            with suppress(FileNotFoundError):
+                os.unlink(self._at(name), dir_fd=fd)
+            file = os.open(self._at(name), _NEW, 0o644, dir_fd=fd)
+            try:
+                try:
+                    _allocate(file, size)
+                    os.fsync(file)
+                finally:
+                    os.close(file)
+            except OSError:
+                with suppress(OSError):
+                    os.unlink(self._at(name), dir_fd=fd)
+                raise
 
     def nameless(self) -> BinaryIO:
         """A new file without a name: it is gone when it is closed, or its process ends."""
@@ -402,6 +442,17 @@ class Directory:
         return ds.DatasetWriteError(f"cannot write {path}: {error.strerror or error}", data)
 
 
+def _allocate(file: int, size: int) -> None:
+    """Give a new file `size` bytes that later writes need no room for."""
+    allocate = getattr(os, "posix_fallocate", None)
+    if allocate is not None:
+        allocate(file, 0, size)
+        return
+    zeros = memoryview(bytes(size))
+    while zeros.nbytes:
+        zeros = zeros[os.write(file, zeros) :]
+
+
 def free_bytes(path: Path) -> int | None:
     """Bytes free for this user on the disk of `path`; None where the system does not say."""
     try:
@@ -445,11 +496,15 @@ def _fields(file: Path) -> dict[str, int]:
 def open_data(root: Path) -> Directory:
     """A twin's data directory, made if it is missing, once files can be written into it.
 
+    A full disk is no hindrance: what must be written has room of its own (`spare_files`).
+
     Raises:
         DatasetWriteError: they cannot; says why.
     """
-    with writing(root, f"the data directory {root} cannot be written"):
+    refused = f"the data directory {root} cannot be written"
+    with writing(root, refused):
         root.mkdir(parents=True, exist_ok=True)
         directory = Directory(root)
+    with suppress(ds.DiskFullError), writing(root, refused):
         directory.nameless().close()
     return directory

@@ -14,15 +14,18 @@ import os
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import TypeVar
 
 from flexdt.protocol.field_checks import MAX_STEM, encoded
 from flexdt.runtime.files.directory import BEFORE, LARGEST, Directory, writing
 from flexdt.runtime.log import log
-from flexdt.twin.dataset.dataset_errors import DatasetWriteError
+from flexdt.twin.dataset.dataset_errors import DatasetWriteError, DiskFullError
 from flexdt.twin.errors import LimitError
 
 T = TypeVar("T")
+Keep = Callable[[str, bytes], None]
+"""Writes a file of a folder, safely."""
 ASIDE = ".unreadable"
 """Goes before the suffix of a file that is set aside; no name of ours has two dots."""
 
@@ -54,6 +57,44 @@ def used_bytes(root: Directory) -> int:
     return total
 
 
+@dataclass(frozen=True)
+class _Change:
+    """A file that was written or deleted.
+
+    Attributes:
+        folder, name: where it is.
+        data: what is there now; None for nothing.
+        before: the name under which what was there is kept; None where nothing was, or is.
+        old: instead, what was there.
+        keep: writes it.
+    """
+
+    folder: Directory
+    name: str
+    data: bytes | None
+    before: str | None
+    old: bytes | None = None
+    keep: Keep | None = None
+
+    def undo(self) -> None:
+        """Restore what was there, unless somebody else has changed it since."""
+        if not self._is_still():
+            return
+        if self.before is not None:
+            self.folder.rename(self.before, self.name)
+        elif self.old is not None:
+            (self.keep or self.folder.keep)(self.name, self.old)
+        else:
+            self.folder.unlink(self.name)
+        self.folder.sync()
+
+    def _is_still(self) -> bool:
+        if self.data is None:
+            return self.folder.stat(self.name) is None
+        found = self.folder.read(self.name, max(LARGEST, len(self.data)))
+        return found == self.data or (self.keep is not None and found.rstrip(b" ") == self.data)
+
+
 class Changes:
     """Files written one after the other, which can all be as they were before.
 
@@ -63,15 +104,29 @@ class Changes:
     """
 
     def __init__(self) -> None:
-        self._made: list[tuple[Directory, str, str | None, bytes | None]] = []
-        """Folder, name, the name under which what was there is kept, and what is there now."""
+        self._made: list[_Change] = []
 
-    def put(self, folder: Directory, name: str, data: bytes) -> None:
-        """Write a file, as `Directory.keep`."""
-        before = self._before()
-        kept = before if _second_name(folder, name, before) else None
-        self._made.append((folder, name, kept, data))
-        folder.keep(name, data)
+    def put(self, folder: Directory, name: str, data: bytes, keep: Keep | None = None) -> None:
+        """Write a file, as `Directory.keep`.
+
+        Args:
+            folder, name, data: where, and what.
+            keep: writes it instead, and may do so on a full disk; spaces may follow the data then.
+        """
+        before, old = self._before(), None
+        try:
+            kept = before if _second_name(folder, name, before) else None
+        except DiskFullError:
+            if keep is None:
+                raise
+            kept, old = None, folder.read(name)
+        self._made.append(_Change(folder, name, data, kept, old, keep))
+        (keep or folder.keep)(name, data)
+
+    def put_json(self, folder: Directory, name: str, document: object) -> None:
+        """Write a JSON document, as `put`."""
+        data = json.dumps(document, indent=1, allow_nan=False).encode("utf-8")
+        self.put(folder, name, data)
 
     def remove(self, folder: Directory, name: str) -> None:
         """Delete a file, safely; none there is fine.
@@ -85,13 +140,8 @@ class Changes:
                 folder.rename(name, before)
             except (FileNotFoundError, NotADirectoryError):
                 return
-            self._made.append((folder, name, before, None))
+            self._made.append(_Change(folder, name, None, before))
             folder.sync()
-
-    def put_json(self, folder: Directory, name: str, document: object) -> None:
-        """Write a JSON document, as `put`."""
-        data = json.dumps(document, indent=1, allow_nan=False).encode("utf-8")
-        self.put(folder, name, data)
 
     def _before(self) -> str:
         return f"{BEFORE}{os.getpid()}-{threading.get_native_id()}-{len(self._made)}"
@@ -107,36 +157,23 @@ class Changes:
 
     def done(self) -> None:
         """Keep what was written."""
-        for folder, _, before, _ in self._made:
-            if before is not None:
+        for change in self._made:
+            if change.before is not None:
                 with suppress(OSError):
-                    folder.unlink(before)
+                    change.folder.unlink(change.before)
         self._made.clear()
 
     def undo(self) -> None:
         """Restore each file unless somebody else has changed it since; failures are logged."""
-        for folder, name, before, data in reversed(self._made):
+        for change in reversed(self._made):
             try:
-                if not _is_still(folder, name, data):
-                    continue
-                if before is None:
-                    folder.unlink(name)
-                else:
-                    folder.rename(before, name)
-                folder.sync()
+                change.undo()
             except FileNotFoundError:
                 continue
             except (OSError, DatasetWriteError) as error:
                 log("a change that was not made is still on the disk", logging.ERROR,
-                    file=str(folder.path / name), reason=str(error))  # fmt: skip
+                    file=str(change.folder.path / change.name), reason=str(error))  # fmt: skip
         self.done()
-
-
-def _is_still(folder: Directory, name: str, data: bytes | None) -> bool:
-    """Whether a file holds `data`, or (None) is not there; FileNotFoundError where it has gone."""
-    if data is None:
-        return folder.stat(name) is None
-    return folder.read(name, max(LARGEST, len(data))) == data
 
 
 def _second_name(folder: Directory, name: str, second: str) -> bool:

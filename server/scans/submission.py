@@ -20,8 +20,8 @@ from flexdt.protocol import Codec
 from flexdt.protocol.messages import Encoded
 from flexdt.protocol.rpc_errors import RpcError, busy, invalid_params, problem
 from flexdt.runtime.files.dataset_folder import dated_name, read_document
-from flexdt.runtime.files.directory import Directory, free_bytes
-from flexdt.runtime.files.own_documents import Changes, used_bytes
+from flexdt.runtime.files.directory import Directory
+from flexdt.runtime.files.own_documents import Changes
 from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.scans.acquisition import Acquisition, FrameListener
 from flexdt.server.scans.checking import CheckInput, Checks
@@ -30,7 +30,8 @@ from flexdt.server.scans.scan_job import Job, JobInputs, Prepare, is_complete
 from flexdt.server.scans.scan_record import FOLDER, JobRecord, ScanSource, StartConditions
 from flexdt.server.scans.stage import Stage
 from flexdt.server.scans.twin_clock import SpeedUp
-from flexdt.server.storage.dataset_writer import RESERVE_BYTES, DatasetWriter
+from flexdt.server.storage.dataset_writer import DatasetWriter
+from flexdt.server.storage.disk_room import DiskRoom
 from flexdt.server.storage.job_files import JobFiles, number_of
 from flexdt.server.storage.memory import Memory, StateStore
 from flexdt.twin.dataset import dataset_errors as ds
@@ -59,7 +60,7 @@ class Submissions:
         shown: told of images for watchers.
         seed: makes the noise's seed of a new scan; None for scans without noise.
         version: of the software, for data sets.
-        quota: bytes that the data directory may hold; None for what the disk holds.
+        room: on the disk.
         checks: of what is submitted.
     """
 
@@ -74,7 +75,7 @@ class Submissions:
     shown: FrameListener
     seed: Callable[[], int | None]
     version: str
-    quota: int | None
+    room: DiskRoom
     checks: Checks = field(default_factory=Checks)
 
     async def check(self, wish: ScanSource, codec: Codec) -> Encoded:
@@ -354,19 +355,11 @@ class Submissions:
 
     def _require_room(self, size: int, name: str) -> None:
         """Refuse a scan that the disk cannot hold."""
-        need, free = size + RESERVE_BYTES, free_bytes(self.root.path)
+        there = 0
         with suppress(FileNotFoundError), self.root.folder(name).entries() as entries:
             images = (e.stat(follow_symlinks=False) for e in entries if e.name.endswith(".tif"))
-            need -= sum(about.st_size for about in images)
-        if self.quota is not None:
-            left = max(0, self.quota - used_bytes(self.root))
-            free = left if free is None else min(free, left)
-        if free is not None and free < need:
-            raise ds.DiskFullError(
-                f"{name} needs {need / 1e6:.1f} MB, of which {RESERVE_BYTES / 1e6:.1f} MB are to "
-                f"stay free; {free / 1e6:.1f} MB are free in {self.root.path}",
-                {"asked": need, "allowed": free, "path": str(self.root.path)},
-            )
+            there = sum(about.st_size for about in images)
+        self.room.require(name, size, there)
 
 
 def name_conflict(name: str, why: str) -> RpcError:

@@ -20,12 +20,10 @@ import tifffile
 
 from flexdt.runtime.files.dataset_folder import put_texts, read_document, tiff_bytes
 from flexdt.runtime.files.directory import Directory, Write, free_bytes, write_some
+from flexdt.server.storage.disk_room import RESERVE_BYTES, require_last
 from flexdt.twin.dataset import dataset_errors as ds
 from flexdt.twin.dataset.file_names import DOCUMENT, SCRIPT, plain_name
 from flexdt.twin.dataset.flexdt_json import DatasetDocument, ScanRecord
-
-RESERVE_BYTES: Final = 16 << 20
-"""Room asked for beside the images: texts, flexdt.json, the file system's own needs."""
 
 INTERRUPTED: Final = "the scan has not finished"
 
@@ -111,7 +109,9 @@ class DatasetWriter:
             raise ds.DatasetWriteError.instead(
                 f"{name}: image is {found}", found, f"uint16 of shape {expected}"
             )
-        self._files.put(name, tiff_bytes(image))
+        data = tiff_bytes(image)
+        require_last(self.folder, name, len(data))
+        self._files.put(name, data)
         with self._lock:
             self._present.add(name)
 

@@ -27,6 +27,7 @@ from flexdt.protocol.methods import document_messages as p
 from flexdt.protocol.rpc_errors import RpcError
 from flexdt.runtime.files import own_documents as own
 from flexdt.runtime.files.directory import Directory
+from flexdt.runtime.files.spare_files import SpareFiles
 from flexdt.runtime.log import log
 from flexdt.server.storage.job_files import Count, JobFiles, JobMemory
 from flexdt.server.storage.scene_document import apply_settings, require_fit, sample_of, save_scene
@@ -180,6 +181,11 @@ class StateStore:
         self._root, self._make = root, make
         self._job_files, self._changed_jobs = job_files, changed_jobs
         self._unwritten: ChangedJobs = {}
+        self._spares = SpareFiles(root)
+        self.problem: str | None = None
+        """Why the last change that did not wait for the disk is not on it; None where it is."""
+        self.noticed: Callable[[str | None], None] = lambda problem: None
+        """Called when there is a problem, and with None when there is none any more."""
         self._changed, self._at_once = asyncio.Event(), asyncio.Event()
         self._writing = asyncio.Lock()
         self._file = threading.Lock()
@@ -220,7 +226,12 @@ class StateStore:
             DatasetWriteError: the system cannot write.
         """
         async with self._writing:
-            await asyncio.to_thread(self._put, self._make(False), self._unwritten_jobs())
+            try:
+                await asyncio.to_thread(self._put, self._make(False), self._unwritten_jobs())
+            except (OSError, DatasetError) as error:
+                self._note(str(error))
+                raise
+            self._note(None)
 
     async def keep(
         self,
@@ -262,6 +273,12 @@ class StateStore:
             await asyncio.to_thread(changes.done)
             return taken
 
+    def _note(self, problem: str | None) -> None:
+        """Say so where the first change since one that was written is not on the disk."""
+        before, self.problem = self.problem, problem
+        if (before is None) != (problem is None):
+            self.noticed(problem)
+
     def end(self) -> None:
         """Write for the last time; a write that is still on its way does not undo it."""
         try:
@@ -288,7 +305,7 @@ class StateStore:
             if self._ended and not memory.ended:
                 return
             self._ended = memory.ended
-            self._root.keep(FILE, _text(memory))
+            self._spares.keep(FILE, _text(memory))
             for name, job in jobs.items():
                 self._put_job(name, job)
 
@@ -312,7 +329,7 @@ class StateStore:
             if files is not None:
                 files(changes)
             if document is not None:
-                changes.put(self._root, FILE, _text(document))
+                changes.put(self._root, FILE, _text(document), self._spares.keep)
 
     def _undo(self, changes: own.Changes) -> None:
         with self._file:

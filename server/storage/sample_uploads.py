@@ -21,6 +21,7 @@ from flexdt.protocol.fields import Payload
 from flexdt.protocol.methods.scanner_messages import LengthUnit, SampleUpload
 from flexdt.runtime.files.directory import Directory, writing
 from flexdt.runtime.log import log
+from flexdt.server.storage.disk_room import DiskRoom, require_last
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 from flexdt.twin.errors import LimitError
 
@@ -62,10 +63,11 @@ class Incoming:
     Args:
         folder: on whose disk they are; made with the first.
         limit: bytes of all of them together; more than the largest upload.
+        room: on the disk; None for any.
     """
 
-    def __init__(self, folder: Directory, limit: int) -> None:
-        self._folder, self._limit = folder, limit
+    def __init__(self, folder: Directory, limit: int, room: DiskRoom | None = None) -> None:
+        self._folder, self._limit, self._disk = folder, limit, room
         self._open: dict[str, _Open] = {}
         self._lock = threading.Lock()
 
@@ -77,6 +79,7 @@ class Incoming:
 
         Raises:
             LimitError: a gap before this chunk, or the upload was dropped for newer ones.
+            DiskFullError: it would leave no room for what must be written.
             DatasetWriteError: the disk does not take it; the upload is given up.
         """
         with self._lock:
@@ -89,6 +92,8 @@ class Incoming:
             new = data[known.received - start :]
             self._make_room(head.name, len(new))
             try:
+                if self._disk is not None:
+                    require_last(self._disk.root.path, head.name, len(new))
                 with self._writing():
                     left = memoryview(new)
                     while left:
@@ -118,6 +123,8 @@ class Incoming:
 
     def _begin(self, head: UploadHead) -> _Open:
         self._close(head.name)
+        if self._disk is not None:  # while it comes, and then under its name
+            self._disk.require(f"the upload {head.name!r}", 2 * head.total)
         while len(self._open) >= MOST:
             self._drop()
         self._folder.make()

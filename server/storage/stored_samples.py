@@ -24,6 +24,7 @@ from flexdt.phantoms import Phantom, PhantomError
 from flexdt.protocol.rpc_errors import too_large
 from flexdt.runtime.files import own_documents as own
 from flexdt.runtime.files.directory import TEMPORARY, Directory
+from flexdt.server.storage.disk_room import DiskRoom
 from flexdt.server.storage.mesh_workers import mesh_apart, scene_apart
 from flexdt.server.storage.sample_uploads import MAX_UPLOAD_BYTES, Incoming, UploadHead
 from flexdt.twin.errors import LimitError, UnknownNameError
@@ -71,13 +72,18 @@ class SampleStore:
         folder: where uploads are kept.
         limit: largest upload [bytes].
         most: uploads there may be.
+        room: on the disk; None for any.
     """
 
     def __init__(
-        self, folder: Directory, limit: int = MAX_UPLOAD_BYTES, most: int = 10_000
+        self,
+        folder: Directory,
+        limit: int = MAX_UPLOAD_BYTES,
+        most: int = 10_000,
+        room: DiskRoom | None = None,
     ) -> None:
         self._folder, self._limit, self._most = folder, limit, most
-        self._incoming: Incoming = Incoming(folder, 2 * limit)
+        self._incoming: Incoming = Incoming(folder, 2 * limit, room)
         self._heads: dict[str, UploadHead] = {}
         """Their revisions are what their files say; those of older servers say nothing."""
         for file in own.ours(folder):

@@ -25,6 +25,7 @@ from flexdt.runtime.access import TwinLimits
 from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.files.own_documents import settle
 from flexdt.runtime.log import LEVELS, log
+from flexdt.runtime.wire_errors import from_root
 from flexdt.server.imaging.projections import Imaging, Projector, TrueGeometry
 from flexdt.server.imaging.radiography import Radiography, predictors, with_spectra
 from flexdt.server.scans.jobs import Jobs, fresh_seed
@@ -34,6 +35,7 @@ from flexdt.server.scans.submission import RESERVED, Submissions
 from flexdt.server.scans.twin_clock import SpeedUp, TwinClock
 from flexdt.server.storage import corrections
 from flexdt.server.storage import memory as kept
+from flexdt.server.storage.disk_room import DiskRoom
 from flexdt.server.storage.job_files import JobFiles, JobMemory, number_of
 from flexdt.server.storage.past_scans import PastScans
 from flexdt.server.storage.stored_samples import ReceivedSample, SampleStore, sample_material
@@ -176,8 +178,9 @@ class TwinServer:
         )
         self.control = ControlLease(self.limits.control_idle_s, wall)
         settle(root, RESERVED)
+        room = DiskRoom(root, self.limits.disk_quota)
         self.samples = SampleStore(
-            root.folder("samples"), self.limits.max_upload, self.limits.max_samples
+            root.folder("samples"), self.limits.max_upload, self.limits.max_samples, room
         )
         self.samples.standing = lambda: (self.scanner.sample.name, self.scanner.sample.material)
         self.shapes = Shapes()
@@ -211,6 +214,7 @@ class TwinServer:
         self.job_files = JobFiles(root)
         self.job_files.settle()
         self.keeper = kept.StateStore(root, self._memory, self.job_files, self.jobs.changed)
+        self.keeper.noticed = self._noticed_disk
         self._unfiled: list[JobMemory] = []
         """Jobs that an earlier server kept in its state, as long as they have no files."""
         self._recalled = False
@@ -226,7 +230,7 @@ class TwinServer:
             shown=self._scan_image,
             seed=seed,
             version=self.version,
-            quota=self.limits.disk_quota,
+            room=room,
         )
         self.failed = asyncio.Event()
         """Set when a part of the twin has died; the process should end."""
@@ -353,7 +357,7 @@ class TwinServer:
             GeometryError: the pose is none a scanner can have.
         """
         snapshot = self.scanner.state(self.clock.now())
-        job = self.jobs.current
+        job, problem = self.jobs.current, self.keeper.problem
         return w.State(
             time=snapshot.time,
             axes={name: w.AxisState(**vars(axis)) for name, axis in snapshot.axes.items()},
@@ -369,6 +373,7 @@ class TwinServer:
             clock=state_views.clock_view(self.clock),
             controller=self.control.holder,
             image=self.live.seen,
+            unsaved=None if problem is None else str(from_root(problem, self.root)),
         )
 
     def _clearance(self, snapshot: ScannerState) -> NearestPair | None:
@@ -458,6 +463,16 @@ class TwinServer:
         """Say something to whoever listens to the topic `log`, and to the server's log."""
         log(message, LEVELS[level], error=False, **data)
         self._publish_log(level, message, data)
+
+    def _noticed_disk(self, problem: str | None) -> None:
+        """Tell everybody that what changes is not on the disk, or that it is again."""
+        if problem is None:
+            self.tell("info", "the state is on the disk again")
+        else:
+            reason = str(from_root(problem, self.root))
+            self.tell("error", "the state is not on the disk, and a kill would lose it",
+                      reason=reason)  # fmt: skip
+        self.feed.changed()
 
     def _publish_log(self, level: w.LogLevel, message: str, data: dict[str, object]) -> None:
         entry = w.LogEntry(level=level, message=message, data=data)

@@ -199,9 +199,9 @@ def test_a_full_disk_pauses_the_job_and_no_partial_file_is_left(
 def test_a_scan_that_does_not_fit_on_the_disk_is_refused_before_it_starts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from flexdt.server.scans import submission
+    from flexdt.server.storage import disk_room
 
-    monkeypatch.setattr(submission, "free_bytes", lambda path: 20 << 20)
+    monkeypatch.setattr(disk_room, "free_bytes", lambda path: 20 << 20)
 
     async def body(lab: Lab) -> None:
         c = lab.client()

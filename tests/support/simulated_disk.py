@@ -26,11 +26,12 @@ Kind = Literal["open", "write", "fsync", "replace", "link", "unlink", "mkdir"]
 NUMBERED = re.compile(r"(\.(?:part|before)-)([\d-]+)")
 """Temporary names of `runtime/files/directory.py`."""
 TAKES_ROOM: tuple[Kind, ...] = ("open", "write", "link", "mkdir")
-"""What a full disk refuses."""
+"""What a full disk refuses: new files, bytes beyond a file's end, and names that a directory has
+not had (a name that it had leaves its place there)."""
 REAL: dict[str, Callable[..., Any]] = {
     name: getattr(os, name)
     for name in ("open", "close", "write", "pwrite", "ftruncate", "fsync", "replace", "rename",
-                 "link", "unlink", "remove", "mkdir")
+                 "link", "unlink", "remove", "mkdir", "posix_fallocate")
 }  # fmt: skip
 
 
@@ -128,7 +129,7 @@ class Disk:
         writes = bool(flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT))
         new = real is not None and writes and not os.path.lexists(real)
         if real is not None and writes:
-            self._change("open", real)
+            self._change("open", real, new)
         fd: int = REAL["open"](path, flags, mode, dir_fd=dir_fd)
         if real is not None and (writes or real.is_dir()):  # others close files behind our back
             self._paths[fd] = real
@@ -142,7 +143,8 @@ class Disk:
 
     def _write(self, fd: int, data: Any) -> int:
         if fd in self._paths:
-            if self._change("write", self._paths[fd]):
+            more = os.lseek(fd, 0, os.SEEK_CUR) + len(data) > os.fstat(fd).st_size
+            if self._change("write", self._paths[fd], more):
                 data = memoryview(data)[: max(1, len(data) // 2)]
             self._bytes.add(os.fstat(fd).st_ino)
         written: int = REAL["write"](fd, data)
@@ -153,6 +155,12 @@ class Disk:
             self._change("write", self._paths[fd])
         written: int = REAL["pwrite"](fd, data, offset)
         return written
+
+    def _posix_fallocate(self, fd: int, offset: int, length: int) -> None:
+        if fd in self._paths:
+            self._change("write", self._paths[fd])
+            self._bytes.add(os.fstat(fd).st_ino)
+        REAL["posix_fallocate"](fd, offset, length)
 
     def _ftruncate(self, fd: int, length: int) -> None:
         if fd in self._paths:
@@ -197,9 +205,10 @@ class Disk:
         follow_symlinks: bool = True,
     ) -> None:
         self._path(src, src_dir_fd)
+        before = len(self.named)
         target = self._path(dst, dst_dir_fd)
         if target is not None and not os.path.lexists(target):
-            self._change("link", target)
+            self._change("link", target, len(self.named) > before)
             self._names.append((target.parent, lambda: _unlink(target)))
         REAL["link"](
             src, dst, src_dir_fd=src_dir_fd, dst_dir_fd=dst_dir_fd, follow_symlinks=follow_symlinks
@@ -239,13 +248,17 @@ class Disk:
         return name
 
     def _keep(self, file: Path) -> Path | None:
-        """A second name for what a change is about to replace."""
+        """A copy of what a change is about to replace; while it is not safe, a second name."""
         if not file.is_file():
             return None
         with suppress(FileExistsError):
             REAL["mkdir"](self._kept)
         kept = self._kept / str(next(self._count))
         REAL["link"](file, kept, follow_symlinks=False)
+        if not kept.is_symlink() and kept.stat().st_ino not in self._bytes:
+            copy = kept.with_suffix(".copy")
+            shutil.copyfile(kept, copy)
+            REAL["replace"](copy, kept)
         return kept
 
     def _ordinal(self, temporary: re.Match[str]) -> str:
@@ -253,8 +266,13 @@ class Disk:
         number = self._ordinals.setdefault(temporary[0], len(self._ordinals))
         return f"{temporary[1]}{number}"
 
-    def _change(self, kind: Kind, path: Path) -> bool:
-        """Count a change, or fail; whether a write is to be short."""
+    def _change(self, kind: Kind, path: Path, takes_room: bool = True) -> bool:
+        """Count a change, or fail; whether a write is to be short.
+
+        Args:
+            kind, path: what, and of what.
+            takes_room: whether it does, if its kind may; what is written in place does not.
+        """
         if self.off:
             raise OSError(errno.EIO, "the power is cut")
         number = len(self.ops) - self._from
@@ -267,7 +285,8 @@ class Disk:
         if fault.error is None:
             self.off = True
             raise OSError(errno.EIO, "the power is cut")
-        if fault.lasting and fault.error == errno.ENOSPC and kind not in TAKES_ROOM:
+        room = takes_room and kind in TAKES_ROOM
+        if fault.lasting and fault.error == errno.ENOSPC and not room:
             return False
         self.failed += 1
         raise OSError(fault.error, os.strerror(fault.error))

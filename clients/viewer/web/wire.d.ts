@@ -105,6 +105,8 @@ export type ImageFlags = {
 };
 export type ImageValue = { shape: Array<number>; data: string };
 export type JobAbort = { job?: string | null; reason?: string | null };
+export type JobForget = { job?: string | null };
+export type JobForgetResult = Record<string, unknown>;
 export type JobListResult = Record<string, unknown>;
 export type JobRef = { job?: string | null };
 export type JobStatus = {
@@ -227,6 +229,7 @@ export interface Methods {
   "job.step": [JobRef, JobStatus];
   "job.abort": [JobAbort, JobStatus];
   "job.list": [Empty, JobListResult];
+  "job.forget": [JobForget, JobForgetResult];
   "dataset.get": [DatasetGet, DatasetResult];
   "calibration.apply": [Correct, CorrectionResult];
   "calibration.list": [Empty, CorrectionListResult];

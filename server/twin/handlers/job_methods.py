@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import base64
 import binascii
-import contextlib
 from collections.abc import Callable
 from datetime import timedelta
 from typing import TypeAlias
@@ -17,6 +16,7 @@ from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods import job_messages as p
 from flexdt.protocol.rpc_errors import invalid_params, too_large
 from flexdt.runtime.files.own_documents import Changes
+from flexdt.runtime.wire_errors import from_root
 from flexdt.server.scans.scan_job import ENDED, Job
 from flexdt.server.scans.scan_record import ScanSource
 from flexdt.server.twin.core import TwinServer
@@ -94,9 +94,15 @@ async def abort(twin: TwinServer, client: h.Client, params: p.JobAbort) -> w.Job
     """The data set stays, marked incomplete, and says why."""
     job = twin.jobs.get(params.job)
     twin.jobs.abort(job, params.reason)
-    with contextlib.suppress(DatasetError):  # an abort does not fail because of the disk
+    unsaved = ""
+    try:
         await twin.keeper.flush()
-    return await _when(twin, job, lambda: job.phase in ENDED)
+    except (OSError, DatasetError) as error:  # an abort does not fail because of the disk
+        reason = from_root(str(error), twin.root)
+        unsaved = f"the abort is not on the disk, and a killed server would not know it: {reason}"
+    status = await _when(twin, job, lambda: job.phase in ENDED)
+    warnings = [*status.warnings, unsaved] if unsaved else status.warnings
+    return status.model_copy(update={"warnings": warnings})
 
 
 @h.answers(p.JOB_LIST)

@@ -1,0 +1,94 @@
+"""Room kept for what must be written: spare files, allocated in advance.
+
+A document is written under a temporary name and renamed, as `Directory.put` does. Where the disk
+has no room for that, it is written into a spare file, whose blocks it has already, and that file
+takes the document's name. It keeps its size (spaces follow the document), so the file that it
+replaces becomes a spare file in turn, and there is no end of such writes. Spare files that are gone
+are made again as soon as there is room. File systems that never overwrite a block in place (btrfs,
+ZFS) may still refuse.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import Final
+
+from flexdt.runtime.files.directory import Directory, writing
+from flexdt.twin.dataset.dataset_errors import DiskFullError
+
+SIZE: Final = 256 << 10
+"""Of a spare file [bytes]; longer documents are written only where the disk has room."""
+COUNT: Final = 8
+PREFIX: Final = ".reserve-"
+NAMES: Final = tuple(f"{PREFIX}{i}" for i in range(COUNT))
+
+
+class SpareFiles:
+    """The spare files of a directory; callers take turns.
+
+    Args:
+        folder: where they are, and the documents.
+    """
+
+    def __init__(self, folder: Directory) -> None:
+        self._folder = folder
+        self._there = {name for name in NAMES if self._usable(name)}
+        self._refill()
+
+    def keep(self, name: str, data: bytes) -> None:
+        """Write a document, safe when this returns, as `Directory.keep`.
+
+        Raises:
+            DatasetWriteError: the system refuses, and there is no spare file.
+        """
+        try:
+            self._folder.keep(name, data)
+        except DiskFullError:
+            if len(data) > SIZE or not self._keep_in_spare(name, data.ljust(SIZE)):
+                raise
+        if len(self._there) < COUNT:
+            self._refill()
+
+    def _keep_in_spare(self, name: str, data: bytes) -> bool:
+        for spare in sorted(self._there):
+            self._there.discard(spare)
+            if not self._usable(spare):  # another name of the document, from a change taken back
+                with suppress(OSError):
+                    self._folder.unlink(spare)
+                continue
+            with writing(self._folder.path / name, f"cannot write {self._folder.path / name}"):
+                self._folder.overwrite(spare, data)
+                self._save(name)
+                self._folder.rename(spare, name)
+                self._folder.sync()
+            return True
+        return False
+
+    def _save(self, name: str) -> None:
+        """Make a spare file of a document that is one by its size, and is about to be replaced."""
+        about = self._folder.stat(name)
+        free = [spare for spare in NAMES if spare not in self._there]
+        if about is None or about.st_size != SIZE:
+            return
+        for spare in free:
+            with suppress(OSError):
+                self._folder.link(name, spare)
+                self._there.add(spare)
+                return
+
+    def _usable(self, name: str) -> bool:
+        """Whether a spare file is there, of full size, and no document too."""
+        about = self._folder.stat(name)
+        return about is not None and (about.st_size, about.st_nlink) == (SIZE, 1)
+
+    def _refill(self) -> None:
+        """Make the spare files that are missing, as far as there is room."""
+        for name in NAMES:
+            if name in self._there:
+                continue
+            try:
+                if not self._usable(name):
+                    self._folder.allocate(name, SIZE)
+            except OSError:  # no room yet, or none for us
+                return
+            self._there.add(name)
