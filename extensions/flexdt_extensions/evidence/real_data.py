@@ -10,6 +10,7 @@ import pickle
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
@@ -41,6 +42,22 @@ class Figure:
 
 
 @dataclass(frozen=True)
+class NotRead:
+    """Data that could not be read, which says nothing of flexdt's answers.
+
+    Attributes:
+        what: file or reader.
+        why: in words.
+    """
+
+    what: str
+    why: str
+
+
+Told = Figure | NotRead
+
+
+@dataclass(frozen=True)
 class Case:
     """A set of real data.
 
@@ -53,7 +70,38 @@ class Case:
     files: str
     source: str
     licence: str
-    compare: Callable[[list[Path]], Iterator[Figure]]
+    compare: Callable[[list[Path]], Iterator[Told]]
+
+    def told(self, files: list[Path]) -> Iterator[Told]:
+        """The figures of these files; what ends them is told as well and raised by nothing."""
+        return _guarded(lambda: self.compare(files), self.files)
+
+
+def _guarded(make: Callable[[], Iterator[Told]], what: str) -> Iterator[Told]:
+    """What `make` tells, and then what ended it.
+
+    An error out of flexdt is a missed figure. A reader that is not installed, and whatever other
+    packages raise for a file of another form than its name says, is `NotRead`.
+    """
+    try:
+        yield from make()
+    except Exception as error:  # readers of other projects have errors of their own
+        said = f"{type(error).__name__}: {error}".rstrip(": ")
+        missing = isinstance(error, fx.TwinError) and (error.data or {}).get("missing")
+        if isinstance(missing, str):
+            yield NotRead(what, str(error))
+        elif any(name.startswith("flexdt.") for name in _modules(error)):
+            yield Figure(what, "an answer", said, False)
+        else:
+            yield NotRead(what, said)
+
+
+def _modules(error: BaseException) -> Iterator[str]:
+    """Names of the modules that an error came through."""
+    at = error.__traceback__
+    while at is not None:
+        yield str(at.tb_frame.f_globals.get("__name__"))
+        at = at.tb_next
 
 
 class _Numbers(pickle.Unpickler):
@@ -103,11 +151,15 @@ SCALE: Final = 0.003
 know the SDD to 0.4 % at best."""
 
 
-def needles(files: list[Path]) -> Iterator[Figure]:
+def needles(files: list[Path]) -> Iterator[Told]:
     """CaTE: marks in radiographs of the FleX-ray itself, of objects of unknown shape."""
     shapes: dict[str, Array] = {}
-    for file in files:
+
+    def of_scan(file: Path) -> Iterator[Told]:
         scan = file.name.removeprefix("needle_25Sep2020_").removesuffix("_locations.npy")
+        if scan not in VIEWS:
+            yield NotRead(file.name, f"views of a turn are known for {', '.join(VIEWS)}")
+            return
         seen = _numbers(file)
         frames = sorted(seen)
         turn = [360.0 * f / VIEWS[scan] for f in frames]
@@ -121,6 +173,9 @@ def needles(files: list[Path]) -> Iterator[Figure]:
         rms = document["rms_px"]
         yield Figure(f"{scan}: shift of the detector", "about -758 mm", ours, near)
         yield Figure(f"{scan}: residual", "hand-made marks", f"{rms:.2f} px rms", rms < 1.0)
+
+    for file in files:
+        yield from _guarded(partial(of_scan, file), file.name)
     for one, other in combinations(shapes, 2):
         apart, scale = _apart(shapes[one], shapes[other])
         ours = f"{apart:.3f} mm rms, {100 * (scale - 1):+.2f} % larger"
@@ -143,7 +198,7 @@ PITCH: Final = (302 / 1524, 307 / 1548)
 """Of the pixels of Delft's panels [mm], as its script has them."""
 
 
-def delft(files: list[Path]) -> Iterator[Figure]:
+def delft(files: list[Path]) -> Iterator[Told]:
     """Three sources about one stage: each calibrated on its own, then how they stand."""
     stored = _numbers(files[0].with_name(f"geom_pre_proc_{DELFT}_calibrated_on_26aug2021.npy"))
     found: list[tuple[Array, Any, complex, float]] = []
@@ -214,7 +269,7 @@ def _across(view: fx.ConeVec, image: Array, normals: Array) -> Array:
     return np.asarray((1 + (line[:, 2] / far) ** 2) * (high - low) / 2)
 
 
-def c_arm(files: list[Path]) -> Iterator[Figure]:
+def c_arm(files: list[Path]) -> Iterator[Told]:
     """Two views of a C-arm by their matrices: planes through both sources have one integral."""
     matrices, images, pixel = [], [], 1.0
     for file in files:
@@ -244,15 +299,19 @@ def c_arm(files: list[Path]) -> Iterator[Figure]:
         yield Figure(f"planes of both sources, {lower} px lower", what, ours, agrees)
 
 
-def helsinki(files: list[Path]) -> Iterator[Figure]:
+def helsinki(files: list[Path]) -> Iterator[Told]:
     """HTC 2022: fan-beam sinograms beside the images that their authors published."""
     from scipy.io import loadmat
 
-    for file in files:
+    def of_scan(file: Path) -> Iterator[Told]:
         name = file.name.removeprefix("htc2022_").removesuffix("_full.mat")
+        published = file.with_name(f"{file.stem}_recon_fbp.mat")
+        if not published.exists():
+            yield NotRead(file.name, f"no {published.name}, the published image, beside it")
+            return
         scan = loadmat(file, simplify_cells=True)["CtDataFull"]
         said = scan["parameters"]
-        image = loadmat(file.with_name(f"{file.stem}_recon_fbp.mat"))["reconFullFbp"]
+        image = loadmat(published)["reconFullFbp"]
         turn = np.asarray(said["angles"], float)
         once = turn < turn[0] + 360.0 - 1e-6  # the last view is the first one again
         lengths = ("distanceSourceOrigin", "distanceSourceDetector", "pixelSizePost")
@@ -264,8 +323,11 @@ def helsinki(files: list[Path]) -> Iterator[Figure]:
         alike = float(np.corrcoef(ours.ravel(), image.ravel())[0, 1])
         yield Figure(f"{name}: correlation", "0.9999", f"{alike:.6f}", alike >= 0.9999)
 
+    for file in files:
+        yield from _guarded(partial(of_scan, file), file.name)
 
-def tooth(files: list[Path]) -> Iterator[Figure]:
+
+def tooth(files: list[Path]) -> Iterator[Told]:
     """Tomopy's tooth: half a turn in a parallel beam, which flexdt does not take."""
     h5py = package("h5py", "HDF5 files", "io")
     with h5py.File(files[0]) as stored:
@@ -280,7 +342,7 @@ def tooth(files: list[Path]) -> Iterator[Figure]:
     yield Figure("FDK", "to be refused", said, "180 deg" in said)
 
 
-def zeiss(files: list[Path]) -> Iterator[Figure]:
+def zeiss(files: list[Path]) -> Iterator[Told]:
     """Tomopy's scan of a chip in Zeiss's own format: a parallel beam, too."""
     said = _said(lambda: fx.open(files[0])).removeprefix(f"{files[0]}: ")
     yield Figure("open", "to be refused", said, "a parallel beam" in said)
