@@ -30,7 +30,7 @@ from flexdt.twin.machine.description import ZERO, Axis, Machine, Profile
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.executed_log import Executed, MotorReply
-from flexdt.twin.script.grammar import own_name
+from flexdt.twin.script.grammar import image_name, kind_of, own_name, sequence_names
 
 YEAR_S: Final = 365.25 * 86400.0
 FOR_A_LINE: Final = 3
@@ -46,6 +46,8 @@ det_tan changes by 0.23 mm rms and the roll by 0.15 deg."""
 AGREE: Final = 1e-4
 """By what part statements of one quantity may differ: texts carry six decimals, cameras round
 their exposures. Motors and offsets may differ by `rebuild.MATCH_MM`."""
+ALIKE: Final = 3
+"""Motors whose limits are a shipped machine's, from which on an executed script is of it."""
 OFFSETS: Final = ("det_tan", "src_ort", "axs_tan", "c_obj", "c_det", "det_roll_deg")
 TELLS: Final = {"axs_tan": "ordinary", "det_roll_deg": "ordinary", "src_ort": "beads",
                 "c_obj": "beads", "c_det": "beads"}  # fmt: skip
@@ -141,20 +143,90 @@ def standing(scan: PastScan, machine: Machine) -> PastScan:
 
 def scripted(scan: PastScan, machine: Machine) -> dict[str, Any]:
     """What its script asks for: axis -> target when the settings file is written, and settings of
-    camera and tube, by the names of `ScanSettings`, when the sequence begins."""
+    camera and tube, by the names of `ScanSettings`, at the first projection.
+
+    `projections` counts all that it saves: those of sequences, and single images.
+    """
     now: dict[str, Any] = {}
     moved: dict[str, Any] = {}
+    first: dict[str, Any] | None = None
+    taken = 0
     for k in scan.commands:
         if isinstance(k, c.MoveAbsolute):
             now[own_name(k.component, machine.axes)] = k.target
         elif isinstance(k, c.CameraSetting | c.TubeSetting):
             now |= k.arguments
-        elif isinstance(k, c.WriteSettingsFile):
+        elif isinstance(k, c.WriteSettingsFile) and first is None:
             moved = {name: value for name, value in now.items() if name in machine.axes}
-        elif isinstance(k, c.TakeSequence):
-            now["projections"] = now.pop("frames", None)
-            return {name: v for name, v in now.items() if name not in machine.axes} | moved
-    return moved
+        elif isinstance(k, c.TakeSequence | c.SaveImage):
+            count = _projections(k, now.get("frames"))
+            taken += count
+            if count and first is None:
+                first = {n: v for n, v in now.items() if n not in machine.axes and n != "frames"}
+    return moved if first is None else first | {"projections": taken} | moved
+
+
+def _projections(command: c.TakeSequence | c.SaveImage, frames: int | None) -> int:
+    """Projections that a command saves; a sequence without a number of frames has one."""
+    if isinstance(command, c.TakeSequence):
+        names: Sequence[str | None] = sequence_names(command.prefix, command.first, frames or 1)
+    else:
+        names = (image_name(command.path),)
+    return sum(name is not None and kind_of(name) == "projection" for name in names)
+
+
+class Scanner(NamedTuple):
+    """Which scanner a scan says it is of: the machine that ships, the serial number, and by what
+    the machine is known; each "" where nothing says it."""
+
+    machine: str = ""
+    serial: str = ""
+    by: str = ""
+
+
+def scanner_of(scan: PastScan, known: Sequence[Machine]) -> Scanner:
+    """Which scanner a scan says it is of: by its texts, or else by the limits of its motors."""
+    texts = [text for text in (scan.settings, scan.second) if text is not None]
+    serial = next((text.serial for text in texts if text.serial), "")
+    for text in texts:
+        named = rebuild.named_machine(text, known)
+        if named is not None:
+            return Scanner(named.name, serial, "its settings text")
+    limits: dict[str, tuple[float, float]] = {}
+    for x in scan.log:
+        if x.motor is not None and isinstance(x.command, c.MotorCommand):
+            limits[x.command.component] = x.motor.lower, x.motor.upper
+    found = max(known, key=lambda machine: _shared(limits, machine), default=None)
+    if found is not None and _shared(limits, found) >= max(ALIKE, len(limits) / 2):
+        return Scanner(found.name, serial, "the motors' limits in its executed script")
+    return Scanner(serial=serial)
+
+
+def _shared(limits: Mapping[str, tuple[float, float]], machine: Machine) -> int:
+    """How many motors have the limits that a machine file has for them."""
+    own = {name: machine.axes.get(own_name(name, machine.axes)) for name in limits}
+    return sum(
+        axis is not None and bool(np.allclose(limits[name], (axis.lower, axis.upper), AGREE, 0.0))
+        for name, axis in own.items()
+    )
+
+
+def other_scanners(scans: Sequence[PastScan], known: Sequence[Machine]) -> str:
+    """Folders by scanner, in words, where they are of more than one; "" otherwise."""
+    told = {scan.name: scanner_of(scan, known) for scan in scans}
+    serials = {one.serial for one in told.values()} - {""}
+    machines = {one.machine for one in told.values()} - {""}
+    if max(len(serials), len(machines)) < 2:
+        return ""
+    groups: dict[Scanner, list[str]] = {}
+    for name, one in told.items():
+        groups.setdefault(one, []).append(name)
+    words = []
+    for one, names in groups.items():
+        serial = f"serial number {one.serial}" if one.serial else "no serial number"
+        machine = f"{one.machine} (by {one.by})" if one.machine else "a scanner that nothing names"
+        words.append(f"{machine}, {serial}: {', '.join(names)}")
+    return "; ".join(words)
 
 
 def contradictions(

@@ -12,7 +12,7 @@ import json
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -25,6 +25,7 @@ from flexdt.library.reading.folders import load_dataset, read_settings
 from flexdt.library.report_page import heading, page, table
 from flexdt.runtime.files.dataset_folder import list_folder, read_image, read_text
 from flexdt.twin import commissioning as tells
+from flexdt.twin.collision.home_check import check_home
 from flexdt.twin.commissioning import PastScan, Question
 from flexdt.twin.dataset import rebuild
 from flexdt.twin.dataset.xre_reading import parse_xre
@@ -51,6 +52,8 @@ NEXT: Final = {
 NEARER: Final = 0.6
 """Of its source-object distance, the scan at another magnification: clearly other, and the sample
 still clears the source in most scanners."""
+MACHINE_FILE: Final = "machine.toml"
+PROFILE_FILE: Final = "profile.toml"
 ReadLog = Callable[[Path, d.Machine], tuple[Executed, ...]]
 Table = tuple[Sequence[str], list[Sequence[Any]]]
 
@@ -121,7 +124,7 @@ def commission(folders: Sequence[Path], traffic: Path | None, read_log: ReadLog)
         read_log: reads an executed script or a recording.
 
     Raises:
-        CommandError: no folder holds anything of a scan.
+        CommandError: no folder holds anything of a scan, or they are of several scanners.
         TwinError: there is no such folder.
     """
     open_questions = list[Question]()
@@ -130,9 +133,15 @@ def commission(folders: Sequence[Path], traffic: Path | None, read_log: ReadLog)
     known = [d.builtin_machine(name) for name in d.builtin_machines()]
     named = [m.name for s in read
              if s.settings and (m := rebuild.named_machine(s.settings, known))]  # fmt: skip
-    if not named:
-        ask(Question("which scanner it is", "no text names one that ships; the FleX-ray is taken"))
     shipped = machines.machine(Counter(named).most_common(1)[0][0] if named else None)
+    if not named:
+        by_limits = [one for s in read
+                     if (one := tells.scanner_of(_script(s, shipped, read_log, _nothing), known))
+                     .machine]  # fmt: skip
+        taken = f"{by_limits[0].machine} is taken by {by_limits[0].by}" if by_limits else (
+            "the FleX-ray is taken")  # fmt: skip
+        ask(Question("which scanner it is", f"no text names one that ships; {taken}"))
+        shipped = machines.machine(by_limits[0].machine if by_limits else None)
     scans = sorted((_script(s, shipped, read_log, ask) for s in read),
                    key=lambda s: s.date or datetime.max)  # fmt: skip
     if traffic is not None:
@@ -140,6 +149,8 @@ def commission(folders: Sequence[Path], traffic: Path | None, read_log: ReadLog)
         told = [x.command for x in log]
         if all([x.command for x in s.log] != told for s in scans):
             scans.append(PastScan(str(traffic), log=log))
+    if words := tells.other_scanners(scans, known):
+        raise CommandError(f"the folders are of several scanners; allowed: those of one. {words}")
     if not any(s.settings or s.log or s.images for s in scans):
         where = ", ".join(map(str, folders))
         raise CommandError(f"{where}: no settings text, executed script or radiograph of a scan")
@@ -151,9 +162,25 @@ def commission(folders: Sequence[Path], traffic: Path | None, read_log: ReadLog)
     unseen += [f"time of {k}" for k in machine.timing.kinds if times.get(k, 0) < ENOUGH]
     why = f"no executed script tells it, or fewer than {ENOUGH} commands of one"
     rest = [*offsets.questions, *(Question(what, why, "recorded") for what in unseen)]
-    findings = [*tells.contradictions(scans, shipped, machine), *offsets.findings]
+    findings = [
+        *_refused(machine, offsets.profile),
+        *tells.contradictions(scans, shipped, machine),
+        *offsets.findings,
+    ]
     questions = [*open_questions, *rest]
     return Commissioned(machine, text, fit, scans, offsets, findings, questions)
+
+
+def _refused(machine: d.Machine, profile: d.Profile) -> Iterator[tells.Finding]:
+    """Why `flexdt machine check` would refuse the machine's file, if it would."""
+    try:
+        check_home(machine, profile, MACHINE_FILE)
+    except TwinError as error:
+        yield tells.Finding(MACHINE_FILE, f"`flexdt machine check` refuses it: {error.message}")
+
+
+def _nothing(question: Question) -> None:
+    """Ask nothing: scripts are read a second time, with the machine that they are of."""
 
 
 def _texts(folder: Path, ask: Callable[[Question], None]) -> PastScan:
@@ -256,9 +283,10 @@ def _measured(scan: PastScan, machine: d.Machine, ask: Callable[[Question], None
 
 def write_commission(found: Commissioned, out: Path) -> None:
     """Write `machine.toml`, `profile.toml`, `commission.json` and `report.html` into a new folder,
-    which appears when all of it is there.
+    which appears when all of it is there and both files are read back.
 
     Raises:
+        MachineFileError: what was written does not hold.
         OSError: it cannot be written.
     """
     part = out.absolute().with_name(f".{out.absolute().name}.part.{os.getpid()}")
@@ -270,12 +298,13 @@ def write_commission(found: Commissioned, out: Path) -> None:
     try:
         part.mkdir(parents=True)
         for name, text in (
-            ("machine.toml", found.text),
-            ("profile.toml", "\n".join(lines) + "\n"),
+            (MACHINE_FILE, found.text),
+            (PROFILE_FILE, "\n".join(lines) + "\n"),
             ("commission.json", json.dumps(found.document(out), indent=1) + "\n"),
             ("report.html", page("Commissioning", body)),
         ):
             (part / name).write_text(text, encoding="utf-8")
+        machines.profile(part / PROFILE_FILE, machines.machine(part / MACHINE_FILE))
         part.rename(out)
     finally:
         shutil.rmtree(part, ignore_errors=True)

@@ -18,8 +18,10 @@ from flexdt.clients.cli.commands.script_files import read_log_file
 from flexdt.clients.following.recording import Recorded, format_recorded
 from flexdt.library import machines
 from flexdt.library.commission import commission
+from flexdt.twin.commissioning import PastScan, scripted
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.script.executed_log import read_log
+from flexdt.twin.script.parse import read_script
 
 LOG = Path(__file__).parents[1] / "data" / "logs" / "unitom_xl_201106_001.txt"
 
@@ -72,8 +74,14 @@ def test_the_command_writes_a_machine_a_profile_and_a_report(
     made, folders = lab
     out = tmp_path / "lab"
     words = [*map(str, folders), "--out", str(out)]
-    assert run(["commission", *words, "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)
+    # The laboratory's limits are drawn without its bodies: its stage would go behind the source.
+    assert run(["commission", *words, "--json"]) == 1
+    said = capsys.readouterr()
+    assert "machine.toml: `flexdt machine check` refuses it: " in said.err
+    assert run(["machine", "check", str(out / "machine.toml")]) == 1
+    assert capsys.readouterr().err.count("SOD goes from") == said.err.count("SOD goes from") == 1
+    document = json.loads(said.out)
+    assert document["disagreements"][0]["about"] == "machine.toml"
     assert document == json.loads((out / "commission.json").read_text())
     assert sorted(p.name for p in tmp_path.iterdir()) == ["lab"]
     machine = machines.machine(out / "machine.toml")
@@ -146,7 +154,63 @@ def test_the_public_log_alone_and_the_same_as_traffic(tmp_path: Path) -> None:
     assert len(alone.fit.lines.rows) == len(twice.fit.lines.rows) == 57
     axis = alone.machine.axes["tra_obj"]
     assert (axis.lower, axis.upper, axis.max_speed) == (12.0, 319.0, 50.0)
-    assert any(q.what == "which scanner it is" for q in alone.questions)
+    assert any("unitom_xl is taken by the motors' limits" in q.why for q in alone.questions)
+    assert alone.machine.name == "unitom_xl"
+
+
+def test_folders_of_two_scanners_are_refused_with_the_folders_of_each(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By the limits that a script's motors reply, and by serial numbers."""
+    folders = Laboratory(31, scans=2, plants=0).write(tmp_path / "past")
+    log = tmp_path / "unitom"
+    log.mkdir()
+    shutil.copy(LOG, log)
+    out = tmp_path / "out"
+    words = [*map(str, folders), "--out", str(out)]
+    assert run(["commission", str(log), *words]) == 1
+    said = capsys.readouterr().err
+    assert (
+        f"unitom_xl (by the motors' limits in its executed script), no serial number: {log}" in said
+    )
+    assert f"flexray (by its settings text), serial number 042_0001: {folders[0]}, " in said
+    assert run(["commission", *words, "--traffic", str(LOG)]) == 1
+    assert str(LOG) in capsys.readouterr().err
+    text = (folders[1] / "scan settings.txt").read_text()
+    (folders[1] / "scan settings.txt").write_text(text.replace("042_0001", "042_0002"))
+    assert run(["commission", *words]) == 1
+    said = capsys.readouterr().err
+    for serial, folder in zip(("042_0001", "042_0002"), folders, strict=True):
+        assert f"serial number {serial}: {folder}" in said
+    assert not out.exists()
+
+
+def saved(count: int, single: bool) -> bytes:
+    """A script of so many projections: one sequence, or single images, besides a dark and flats."""
+    single_images = "".join(
+        f"camera\ttake image\t\t\tACK\ncamera\tsave image\tE:\\a\\scan_{k:06d}.tif\t\tACK\n"
+        for k in range(count)
+    )
+    sequence = (
+        f"camera\tset number of frames\t{count}\t\tACK\n"
+        "camera\ttake and save image sequence\tE:\\a\\scan_\t\tACK\t0\n"
+    )
+    head = "".join(
+        f"camera\ttake image\t\t\tACK\ncamera\tsave image\tE:\\a\\{name}\t\tACK\n"
+        for name in ("di000000.tif", "io000000.tif", "io000001.tif")
+    )
+    return (head + (single_images if single else sequence)).encode()
+
+
+@pytest.mark.parametrize("single", [True, False])
+@pytest.mark.parametrize("count", [1, 5, 12])
+def test_projections_of_a_script_are_counted_however_they_are_taken(
+    single: bool, count: int
+) -> None:
+    script, problems = read_script(saved(count, single))
+    assert [p for p in problems if p.severity == "error"] == []
+    scan = PastScan("a", commands=script.commands)
+    assert scripted(scan, builtin_machine())["projections"] == count
 
 
 def test_limits_from_a_recording_of_raw_messages(

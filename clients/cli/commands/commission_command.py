@@ -24,8 +24,8 @@ def commission(
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise CommandError(f"{out} is there; allowed: a new or an empty folder")
+    from flexdt.library.commission import MACHINE_FILE, write_commission
     from flexdt.library.commission import commission as commissioned
-    from flexdt.library.commission import write_commission
     from flexdt.library.report_page import cell_text
 
     found = commissioned(folders, traffic, read_log_file)
@@ -34,3 +34,6 @@ def commission(
     for title, (head, rows) in found.tables(out).items():
         yield f"{title}\n{table(([cell_text(x) for x in row] for row in rows), head)}\n"
     yield f"{out}: machine.toml, profile.toml, commission.json and report.html written"
+    refused = [finding.text for finding in found.findings if finding.about == MACHINE_FILE]
+    if refused:
+        raise CommandError(f"{out / MACHINE_FILE}: {refused[0]}")
