@@ -2,11 +2,12 @@
 their positions are known.
 
 `BeadPhantom` is the protocol that any phantom satisfies; `BeadModel` is the frozen value that
-calibration computes with. Materials and meshes play no part here.
+calibration computes with. Meshes play no part here, materials by their contrast alone.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
@@ -16,6 +17,7 @@ import numpy.typing as npt
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 
 
 @runtime_checkable
@@ -41,12 +43,15 @@ class BeadModel:
         tolerance_mm: standard deviation of each coordinate of each bead about `beads` [mm]; 0 if
             the phantom is exact.
         name: for reports.
+        contrast: (k,) line integral through each bead's middle above its surroundings; None: they
+            are of one material.
     """
 
     beads: FloatArray
     bead_radius_mm: FloatArray
     tolerance_mm: float = 0.0
     name: str = "phantom"
+    contrast: FloatArray | None = None
 
     def __post_init__(self) -> None:
         beads = np.array(self.beads, dtype=np.float64, ndmin=2, order="C")
@@ -65,6 +70,11 @@ class BeadModel:
 
     def __len__(self) -> int:
         return len(self.beads)
+
+    @property
+    def contrasts(self) -> FloatArray:
+        """Contrast of each bead to a common factor, (k,)."""
+        return 2.0 * self.bead_radius_mm if self.contrast is None else self.contrast
 
     def mirrored(self) -> BeadModel:
         """The mirror image (x to -x): what a wrongly handed model would look like."""
@@ -87,14 +97,43 @@ def bead_model(phantom: BeadPhantom | BeadModel | npt.ArrayLike) -> BeadModel:
         case BeadModel():
             return phantom
         case BeadPhantom():
-            return BeadModel(
+            model = BeadModel(
                 np.asarray(phantom.beads),
                 np.asarray(phantom.bead_radius_mm, dtype=np.float64),
                 float(getattr(phantom, "bead_tolerance_mm", 0.0)),
                 str(getattr(phantom, "name", "phantom")),
             )
+            return with_contrast(model, getattr(phantom, "scene", None))
         case _:
             return BeadModel(np.asarray(phantom, dtype=np.float64), np.array(1.0))
+
+
+def with_contrast(model: BeadModel, scene: Scene | None) -> BeadModel:
+    """Add the contrast that the phantom's solids give each bead, unless some bead is no ball.
+
+    Args:
+        model: the beads.
+        scene: the phantom's solids; None if it has none.
+    """
+    balls = [solid for solid in (scene or Scene(())).solids if isinstance(solid.shape, Sphere)]
+    if model.contrast is not None or not balls:
+        return model
+    nearest = [_ball_of(balls, centre) for centre in model.beads]
+    gaps = np.linalg.norm(np.array([_centre(ball) for ball in nearest]) - model.beads, axis=1)
+    if not (gaps < 0.5 * model.bead_radius_mm).all():
+        return model
+    attenuation = np.array([ball.mu_per_mm for ball in nearest])
+    return replace(model, contrast=2.0 * model.bead_radius_mm * attenuation)
+
+
+def _ball_of(balls: Sequence[Solid], centre: FloatArray) -> Solid:
+    """Give the ball whose centre is nearest."""
+    return min(balls, key=lambda ball: float(np.linalg.norm(_centre(ball) - centre)))
+
+
+def _centre(ball: Solid) -> FloatArray:
+    assert isinstance(ball.shape, Sphere)
+    return np.asarray(ball.shape.center, dtype=np.float64)
 
 
 def spot_radii(model: BeadModel, cone: ConeVec) -> FloatArray:

@@ -82,7 +82,7 @@ def nothing(shape: tuple[int, int]) -> Detections:
 def look_at(image: Float32Array, detector: SpotFinder) -> FrameSpots:
     """Detect the beads of one line-integral image, unless it is dark."""
     shape = (image.shape[0], image.shape[1])
-    if float(np.median(image[::16, ::16])) > DARK:
+    if not detector.intensities and float(np.median(image[::16, ::16])) > DARK:
         return FrameSpots(nothing(shape), FrameState.DARK)
     return FrameSpots(detect_beads(image, detector), FrameState.USABLE)
 

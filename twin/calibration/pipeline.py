@@ -10,8 +10,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model
+from flexdt.twin.calibration.bead_model import (
+    BeadModel,
+    BeadPhantom,
+    bead_model,
+    with_contrast,
+)
 from flexdt.twin.calibration.bead_sizes import judge_first_sizes, judge_sizes
+from flexdt.twin.calibration.detect.bead_contrast import detector_for
 from flexdt.twin.calibration.detect.detection import SpotFinder
 from flexdt.twin.calibration.diagnose import Finding, listed
 from flexdt.twin.calibration.diagnose.data import judge_emptiness, judge_frames
@@ -31,11 +37,7 @@ from flexdt.twin.calibration.identified_scans import identify_scans
 from flexdt.twin.calibration.motion_of_scans import fit_with_motion, settle_motion
 from flexdt.twin.calibration.outcome import Calibration
 from flexdt.twin.calibration.request import CalibrationRequest, with_free
-from flexdt.twin.calibration.scans_to_calibrate import (
-    detector_for,
-    require_different,
-    require_scans,
-)
+from flexdt.twin.calibration.scans_to_calibrate import require_different, require_scans
 from flexdt.twin.calibration.second_measurement import measure_again
 from flexdt.twin.projection.analytic_solids import Scene
 
@@ -93,7 +95,7 @@ def calibrate(
     asked = CalibrationRequest() if request is None else request
     solids = getattr(phantom, "scene", None) if scene is None else scene
     require_scans(scans)
-    state = _detected(scans, bead_model(phantom), detector)
+    state = _detected(scans, with_contrast(bead_model(phantom), solids), detector)
     if state.errors:
         return state
     state = identify_scans(state, asked)
@@ -126,7 +128,7 @@ def _detected(scans: Sequence[Scan], model: BeadModel, detector: SpotFinder | No
     findings = [
         finding
         for scan, some, how in zip(scans, looks, sought, strict=True)
-        for finding in judge_frames(scan.name, some, how)
+        for finding in judge_frames(scan, some, how)
     ]
     if detector is None and any(finding.forbids for finding in findings):
         findings = [*judge_emptiness(scans, looks, model), *findings]

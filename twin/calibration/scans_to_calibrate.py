@@ -1,30 +1,17 @@
-"""Checks of the scans before anything is measured in them, and what spots to look for."""
+"""Checks of the scans before anything is measured in them."""
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
 
-from flexdt.twin.calibration.bead_model import BeadModel
-from flexdt.twin.calibration.detect.detection import SpotFinder
 from flexdt.twin.calibration.frame_source import (
     FrameSpots,
     Scan,
 )
 from flexdt.twin.errors import GeometryError, TwinError
-from flexdt.twin.geometry.poses import Poses
-
-
-def detector_for(model: BeadModel, poses: Poses) -> SpotFinder:
-    """Make a detector for the sizes the beads' spots can have at a rough geometry."""
-    low = float(model.bead_radius_mm.min() * poses.pixels_per_mm.min())
-    high = float(model.bead_radius_mm.max() * poses.pixels_per_mm.max())
-    sizes = model.bead_radius_mm
-    same = math.inf if sizes.max() > 1.2 * sizes.min() else 1.6
-    return SpotFinder(radius_px=(0.65 * low, 1.5 * high), same=same)
 
 
 def require_scans(scans: Sequence[Scan]) -> None:

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.camera_lag import lag_of, without_lag
-from flexdt.twin.calibration.detect.refine import FEW_WINDOWS, contrast_of, measure_beads
+from flexdt.twin.calibration.detect.bead_contrast import seen_contrasts
+from flexdt.twin.calibration.detect.refine import FEW_WINDOWS, measure_beads
 from flexdt.twin.calibration.detect.windows import Windows, mended, plan_windows
 from flexdt.twin.calibration.diagnose import Finding, error
 from flexdt.twin.calibration.fit.fit import FitResult
@@ -70,11 +70,12 @@ def _measured(
 ) -> tuple[Calibration, list[Windows]]:
     """Measure the beads of every scan where a fit expects them; the lag in the first round only."""
     measured, lags, plans = [], [], []
-    model = BeadModel(fit.beads, state.model.bead_radius_mm)
+    model = replace(state.model, beads=fit.beads)
     for g, scan in enumerate(state.scans):
         cone = scan.poses.cone_vec(fit.group_parameters[g])
         plan = plan_windows(model, cone, scan.frames.shape)
-        contrast = contrast_of([look.detections.contrast for look in state.looks[g]])
+        spots = [look.detections for look in state.looks[g]]
+        contrast = seen_contrasts(model, spots, state.identifications[g].index)
         images = scan.frames.windows(plan)
         lag = state.lags[g] if state.measured else lag_of(images, scan.frames, plan)
         if lag.seen:

@@ -33,6 +33,10 @@ MISFIT = 0.3
 """Largest misfit of a fitted ball, as a share of its spot's contrast."""
 BLUR_PX = 0.7
 """Assumed blur (focal spot, scintillator) where a ball is fitted to part of a spot."""
+BRIGHT_PERCENT = 99.0
+"""Percentile of the pixels of an image of intensities that stands for the open beam."""
+LEAST_LIGHT = 1e-4
+"""Least intensity that is taken a logarithm of, as a share of the open beam."""
 _Candidate = tuple[float, float, float]
 """Column, row, radius [px], as in the kernels' results."""
 _Found = TypeVar("_Found", _Candidate, FloatArray)
@@ -87,11 +91,15 @@ class SpotFinder:
     Attributes:
         radius_px: smallest and largest radius of a bead's spot.
         same: a spot whose contrast and radius differ from the typical ones by more than this
-            factor is dropped; inf keeps beads of several sizes.
+            factor is dropped; inf keeps beads of several sizes and materials.
+        faintest: least height of a bead, as a share of the strongest small structure's.
+        intensities: the images hold intensities that were taken for line integrals.
     """
 
     radius_px: tuple[float, float] = (1.5, 60.0)
     same: float = 1.6
+    faintest: float = FAINTEST
+    intensities: bool = False
 
 
 def detect_beads(
@@ -129,12 +137,20 @@ def detect_beads(
         raise TwinError.of_shape("an image", data.shape, ("rows", "cols"))
     if not np.isfinite(data).all():
         data = np.nan_to_num(data, nan=0.0, posinf=16.0, neginf=0.0)
+    if how.intensities:
+        data = of_intensity(data)
     low = how.radius_px[0]
     factor = 4 if low >= 4.5 else 2 if low >= 2.5 else 1
     whole, cut = _candidates(coarser(data, factor), factor, how)
     found = [r for r in (_measure(data, c, how) for c in whole) if r is not None]
     found = _alike(_distinct(found, kernels.SCORE, 0.5), how)
     return _pack(found, _cut_beads(data, cut, found), (data.shape[0], data.shape[1]))
+
+
+def of_intensity(image: Float32Array) -> Float32Array:
+    """Line integrals of an image of intensities, about those of its brightest pixels."""
+    bright = max(float(np.percentile(image, BRIGHT_PERCENT)), 1e-12)
+    return np.asarray(-np.log(np.maximum(image / bright, LEAST_LIGHT)), dtype=np.float32)
 
 
 def coarser(image: Float32Array, factor: int) -> Float32Array:
@@ -166,7 +182,7 @@ def _candidates(
     sample = small[::3, ::3].ravel()
     noise = 1.4826 * _middle(np.abs(sample - _middle(sample))) + 1e-4
     top = float(small.max())
-    floor = max(8.0 * noise, FAINTEST * top)
+    floor = max(8.0 * noise, how.faintest * top)
     inside: list[_Candidate] = []
     edge: list[_Candidate] = []
     level = 0.5 * top
@@ -247,47 +263,74 @@ def _alike(found: list[FloatArray], how: SpotFinder) -> list[FloatArray]:
     """Keep the spots that resemble the strongest group: beads of a phantom are alike."""
     if math.isinf(how.same) or len(found) < 2:
         return found
+    return _largest_group(found, how.same)[0]
+
+
+def _largest_group(
+    found: list[FloatArray], same: float
+) -> tuple[list[FloatArray], list[FloatArray]]:
+    """Split spots into the largest group whose contrasts and radii are alike up to a factor, among
+    equals the stronger one, and the others."""
     peaks = np.array([r[kernels.PEAK] for r in found])
     radii = np.array([r[kernels.RADIUS] for r in found])
-    limit = math.log(how.same)
+    limit = math.log(same)
     alike = np.abs(np.log(peaks / peaks[:, None])) < limit
     alike &= np.abs(np.log(radii / radii[:, None])) < limit
-    # The largest group; among equals the stronger one.
     best = alike[np.argmax(alike.sum(axis=1) + 0.5 * peaks / peaks.max())]
-    return [r for r, keep in zip(found, best, strict=True) if keep]
+    return (
+        [r for r, inside in zip(found, best, strict=True) if inside],
+        [r for r, inside in zip(found, best, strict=True) if not inside],
+    )
+
+
+def _kinds(found: list[FloatArray]) -> list[tuple[float, float]]:
+    """Typical radius and contrast of each group of spots that are alike."""
+    out = []
+    while found:
+        group, found = _largest_group(found, SpotFinder.same)
+        typical = np.median(group, axis=0)
+        out.append((float(typical[kernels.RADIUS]), float(typical[kernels.PEAK])))
+    return out
 
 
 def _cut_beads(
     image: Float32Array, spots: list[_Candidate], found: list[FloatArray]
 ) -> list[FloatArray]:
-    """Balls fitted to spots at the edge, with the radius and contrast of the whole ones.
+    """Balls fitted to spots at the edge, with radius and contrast of the kind of whole ones that
+    leaves least.
 
     Without any whole bead in the image there is nothing to compare with, and they are left out.
     """
-    if not found or not spots:
-        return []
-    radius = float(np.median([r[kernels.RADIUS] for r in found]))
-    peak = float(np.median([r[kernels.PEAK] for r in found]))
+    kinds = _kinds(found) if spots else []
     out: list[FloatArray] = []
-    none = np.zeros((0, 0), np.uint8)
-    round_ = np.array([1.0, 0.0, 1.0])
     for x, y, _ in spots:
-        result = np.zeros(kernels.RESULTS)
-        window, left, top = _window(image, x, y, 2.8 * radius + 8.0)
-        kernels.fit_ball(
-            window, none, x - left, y - top, radius, round_, peak, BLUR_PX, 0.0, False, False,
-            result,
-        )  # fmt: skip
-        result[kernels.X] += left
-        result[kernels.Y] += top
-        good = result[kernels.OK] > 0 and result[kernels.NOISE] < MISFIT
-        if good and result[kernels.SCORE] > 0.3:
-            # Blur is not known yet: it changes where a radius puts the centre.
-            slack = (0.4 * max(1.0 - result[kernels.SCORE], 0.0)) ** 2
-            result[kernels.VAR_X] += slack
-            result[kernels.VAR_Y] += slack
-            out.append(result)
+        fits = [_fitted_cut(image, x, y, radius, peak) for radius, peak in kinds]
+        good = [fit for fit in fits if fit is not None]
+        out += sorted(good, key=lambda fit: float(fit[kernels.NOISE]))[:1]
     return _distinct(out, kernels.SCORE, 0.5)
+
+
+def _fitted_cut(
+    image: Float32Array, x: float, y: float, radius: float, peak: float
+) -> FloatArray | None:
+    """A ball of a radius and contrast fitted to a spot at the edge; None if it is none."""
+    result = np.zeros(kernels.RESULTS)
+    window, left, top = _window(image, x, y, 2.8 * radius + 8.0)
+    kernels.fit_ball(
+        window, np.zeros((0, 0), np.uint8), x - left, y - top, radius, np.array([1.0, 0.0, 1.0]),
+        peak, BLUR_PX, 0.0, False, False, result,
+    )  # fmt: skip
+    result[kernels.X] += left
+    result[kernels.Y] += top
+    if not (result[kernels.OK] > 0 and result[kernels.NOISE] < MISFIT):
+        return None
+    if not result[kernels.SCORE] > 0.3:
+        return None
+    # Blur is not known yet: it changes where a radius puts the centre.
+    slack = (0.4 * max(1.0 - result[kernels.SCORE], 0.0)) ** 2
+    result[kernels.VAR_X] += slack
+    result[kernels.VAR_Y] += slack
+    return result
 
 
 def _pack(whole: list[FloatArray], cut: list[FloatArray], shape: tuple[int, int]) -> Detections:

@@ -10,7 +10,6 @@ and no bead is missed.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -155,7 +154,7 @@ def measure_beads(
     sharp = sharpness(patches, sample, BLUR_PX)
     if not draft:
         sharp = seen_sharpness(sharp, patches, sample, cone, model)
-    balls = balls_of(model, patches.peaks[:k], sharp.size)
+    balls = balls_of(model, sharp.lift * patches.peaks[:k], sharp.size)
     if sharp.blur < BODY_BLUR_PX:
         alone = None if draft else render_windows(balls, cone, windows)
     else:
@@ -280,13 +279,7 @@ def _accept(results: FloatArray, windows: Windows, contrast: FloatArray, sharp: 
         np.where(good[..., None, None], covariances_of(results), np.nan),
         np.where(good, results[..., kernels.BIAS], 0.0),
         np.where(good, peak, np.nan),
-        sharp.scale if sharp.seen else math.nan,
-        sharp.blur,
+        sharp.size if sharp.seen else math.nan,
+        sharp.true,
         SHARP_SAMPLING_PX if sharp.blur < BODY_BLUR_PX else SAMPLING_PX,
     )
-
-
-def contrast_of(values: Sequence[FloatArray]) -> float:
-    """Typical contrast of detections in several frames; nan without any."""
-    parts = [v for v in values if len(v)]
-    return float(np.median(np.concatenate(parts))) if parts else math.nan

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect import spot_kernels as kernels
-from flexdt.twin.calibration.detect.patches import Patches, fits, usable
+from flexdt.twin.calibration.detect.patches import Patches, centroids, fits, usable
 from flexdt.twin.calibration.detect.windows import (
     blurred_windows,
     render_windows,
@@ -36,6 +36,10 @@ VEILS = (0.0, 0.1, 0.2, 0.3, 0.45, 0.6)
 """Veils that are tried."""
 CHECK_FINE = 3
 """Rays along a pixel's side where that estimate is checked on rendered beads."""
+SMALL_STEP = 0.05
+"""Relative change of blur and contrast by a correction, up to which what it leaves is of second
+order."""
+MOST_ROUNDS = 6
 BODY_BLUR_PX = 0.18
 """Blur of the images below which the rendered body is subtracted as it is."""
 _Tried = tuple[FloatArray, FloatArray, FloatArray]
@@ -69,6 +73,7 @@ class Sharp:
         seen: they were seen, not assumed.
         true: the blur with which rendered beads look the same.
         size: likewise the factor on the beads' radii.
+        lift: likewise the factor on the beads' contrast, of which blur takes a part.
     """
 
     blur: float
@@ -77,6 +82,7 @@ class Sharp:
     seen: bool
     true: float
     size: float
+    lift: float = 1.0
 
 
 def seen_sharpness(
@@ -86,25 +92,54 @@ def seen_sharpness(
     is an approximation, and where a spot is cut by the edge its radius decides its place."""
     if not sharp.seen or sharp.blur < BODY_BLUR_PX:
         return sharp
+    trial = replace(sharp, true=sharp.blur, size=1.0)
+    for _ in range(MOST_ROUNDS):
+        found, dimmed = _as_rendered(trial, patches, sample, cone, model)
+        if not found.seen:
+            return sharp
+        step = sharp.blur - found.blur
+        trial = replace(
+            trial,
+            true=max(trial.true + step, BLURS[0]),
+            size=trial.size * sharp.scale / found.scale,
+            lift=trial.lift / dimmed,
+        )
+        if max(abs(step) / trial.true, abs(dimmed - 1.0)) < SMALL_STEP:
+            return trial
+    return sharp
+
+
+def _as_rendered(
+    true: Sharp,
+    patches: Patches,
+    sample: npt.NDArray[np.intp],
+    cone: ConeVec,
+    model: BeadModel,
+) -> tuple[Sharp, float]:
+    """Estimate sharpness from beads that are rendered with a blur, a size and a contrast.
+
+    Returns:
+        What is estimated, and the rendered contrast over that of the images.
+    """
     k = patches.windows.corner.shape[1]
     frames, beads = np.divmod(sample, k)
     few = patches.windows.pick(frames, beads)
-    balls = balls_of(model, patches.peaks[:k])
+    balls = balls_of(model, true.lift * patches.peaks[:k], true.size)
     rays = render_windows(balls, cone[frames], few, CHECK_FINE)
-    seen = blurred_windows(rays, rest_of_blur(sharp.blur, CHECK_FINE))
-    side = few.side
+    seen = blurred_windows(rays, rest_of_blur(true.true, CHECK_FINE))
+    side, every = few.side, np.arange(len(sample))
     rendered = replace(
         patches, flat=seen.reshape(-1, side, side), offsets=patches.offsets[sample],
         radii=patches.radii[sample], stretch=patches.stretch[sample], peaks=patches.peaks[sample],
         windows=few,
     )  # fmt: skip
-    found = sharpness(rendered, np.arange(len(sample)), sharp.blur)
-    if not found.seen:
-        return sharp
-    true = 2.0 * sharp.blur - found.blur
-    if not abs(true - sharp.blur) < 0.2 * sharp.blur:
-        return sharp
-    return replace(sharp, true=true, size=sharp.scale / found.scale)
+    results = centroids(rendered, every)
+    good = results[:, kernels.OK] > 0
+    if not good.any():
+        return replace(true, seen=False), 1.0
+    dimmed = float(np.median(results[good, kernels.PEAK] / rendered.peaks[good]))
+    rendered = replace(rendered, peaks=dimmed * rendered.peaks)
+    return sharpness(rendered, every, true.true), dimmed
 
 
 def sharpness(patches: Patches, sample: npt.NDArray[np.intp], blur: float) -> Sharp:

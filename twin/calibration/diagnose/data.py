@@ -57,7 +57,8 @@ TURN_WIDTH = {"angle_scale": 0.1}
 SAMPLED = 8
 """Frames that are looked at one by one."""
 
-
+SHOWN_AT_LEAST = 0.5
+"""Share of the frames in which another way to read the images must show spots to be said."""
 SHOWN = 5
 """Files that cannot be used and are named."""
 _STATES = {
@@ -67,9 +68,9 @@ _STATES = {
 }
 
 
-def judge_frames(name: str, looks: Sequence[FrameSpots], sought: SpotFinder) -> list[Finding]:
+def judge_frames(scan: Scan, looks: Sequence[FrameSpots], sought: SpotFinder) -> list[Finding]:
     """Missing and dark frames, and frames without any spot like those that were `sought`."""
-    out = []
+    out, name = [], scan.name
     n = len(looks)
     for state, (code, what) in _STATES.items():
         some = [look for look in looks if look.state is state]
@@ -89,12 +90,25 @@ def judge_frames(name: str, looks: Sequence[FrameSpots], sought: SpotFinder) -> 
                 f"{name}: no bead was found in any of {n} frames; looked for were round spots, "
                 f"darker than what is round them, of {sought.radius_px[0]:.1f} to "
                 f"{sought.radius_px[1]:.1f} px radius: is this a bead phantom, is it in the beam, "
-                "and are geometry and pixel size right?",
+                f"and are geometry and pixel size right?{_of_intensities(scan, sought)}",
             )
         )
     elif empty:
         out.append(warning("frames_empty", f"{name}: {empty} of {n} frames show no bead"))
     return out
+
+
+def _of_intensities(scan: Scan, sought: SpotFinder) -> str:
+    """Say so if the beads show once the images are taken for intensities."""
+    looks = scan.frames.look(replace(sought, intensities=True))
+    shown = sum(len(look.detections) > 0 for look in looks)
+    if shown < SHOWN_AT_LEAST * len(looks):
+        return ""
+    return (
+        f" Taken as transmissions, {shown} of {len(looks)} frames show such spots: the images hold "
+        "transmissions or counts instead of line integrals; give a flat image, which transmissions "
+        "have as ones, or -ln of the images"
+    )
 
 
 def judge_emptiness(

@@ -1,0 +1,61 @@
+"""How dark the beads' spots may be, and how dark each bead is as the first measurement has it.
+
+Beads of a phantom may be of several sizes and materials. Their contrasts at the energy of the
+phantom's attenuations give no more than a rough ratio in a tube's beam, so they tell how faint a
+spot may be, and stand in where a bead was not seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.calibration.bead_model import BeadModel
+from flexdt.twin.calibration.detect.detection import FAINTEST, Detections, SpotFinder
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.poses import Poses
+
+ALIKE = 1.2
+"""Factor between the sizes or contrasts of a phantom's beads from which they are of several
+kinds."""
+
+
+def detector_for(model: BeadModel, poses: Poses) -> SpotFinder:
+    """Make a detector for the sizes and contrasts the beads' spots can have at a rough geometry."""
+    sizes, contrasts = model.bead_radius_mm, model.contrasts
+    dark = contrasts[contrasts > 0]
+    faintest = float(dark.min() / dark.max()) if len(dark) else 1.0
+    several = sizes.max() > ALIKE * sizes.min() or faintest * ALIKE < 1.0
+    return SpotFinder(
+        radius_px=(
+            0.65 * float(sizes.min() * poses.pixels_per_mm.min()),
+            1.5 * float(sizes.max() * poses.pixels_per_mm.max()),
+        ),
+        same=np.inf if several else SpotFinder.same,
+        faintest=FAINTEST * faintest,
+    )
+
+
+def seen_contrasts(
+    model: BeadModel, detections: Sequence[Detections], index: npt.NDArray[np.int64]
+) -> FloatArray:
+    """Typical contrast of each bead, (k,); of one that was not seen, as the others' ratio has it.
+
+    Args:
+        model: the beads, k.
+        detections: of n frames.
+        index: (n, k) which spot of a frame is which bead, -1 for none.
+    """
+    seen = np.full(index.shape, np.nan)
+    for frame, (found, numbers) in enumerate(zip(detections, index.tolist(), strict=True)):
+        beads = [k for k, number in enumerate(numbers) if number >= 0]
+        seen[frame, beads] = found.contrast[[numbers[k] for k in beads]]
+    known = np.isfinite(seen).any(axis=0)
+    if not known.any():
+        return np.full(len(model), np.nan)
+    typical = np.full(len(model), np.nan)
+    typical[known] = np.nanmedian(seen[:, known], axis=0)
+    ratio = float(np.median(typical[known] / model.contrasts[known]))
+    return np.where(known, typical, ratio * model.contrasts)
