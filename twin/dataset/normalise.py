@@ -22,6 +22,9 @@ MIN_FLAT: Final = 1.0
 MIN_COUNTS: Final = 0.5
 """Counts above dark that a pixel without signal is taken to have."""
 
+LEAST_LIGHT: Final = 1e-6
+"""Open beam that a pixel of images on another scale has at least, as a share of the brightest."""
+
 
 @dataclass(frozen=True, eq=False)
 class LineIntegrals:
@@ -64,6 +67,22 @@ class LineIntegrals:
         if len(self.nearest):
             out[self.dead] = out.reshape(-1)[self.nearest]
         return out
+
+
+def of_intensities(
+    images: npt.NDArray[Any], dark: npt.NDArray[Any] | float, flat: npt.NDArray[Any]
+) -> Float32Array:
+    """Line integrals of images that are no whole numbers of counts: dark-subtracted, averaged or
+    scaled ones, such as transmissions with a flat image of ones.
+
+    Args:
+        images: (n, rows, cols), of any scale, below the dark image where noise makes them so.
+        dark: mean dark image (rows, cols), or one value, on the same scale.
+        flat: mean flat image (rows, cols), on the same scale.
+    """
+    opened = np.maximum(flat - dark, LEAST_LIGHT * np.max(flat))
+    light = (np.asarray(images, dtype=np.float32) - dark) / opened
+    return np.asarray(-np.log(np.maximum(light, np.finfo(np.float32).tiny)), dtype=np.float32)
 
 
 def _nearest(dead: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:

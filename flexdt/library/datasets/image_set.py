@@ -19,7 +19,7 @@ import numpy.typing as npt
 from flexdt.runtime.files.dataset_folder import Frame, mean_image, read_image
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetMissingError
 from flexdt.twin.dataset.flexdt_json import DatasetDocument
-from flexdt.twin.dataset.normalise import LineIntegrals
+from flexdt.twin.dataset.normalise import LineIntegrals, of_intensities
 from flexdt.twin.dataset.scan_settings import ScanSettings
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
@@ -136,10 +136,11 @@ class ImageSet:
         """A data set in memory.
 
         Args:
-            counts: (n, rows, cols), whole numbers from 0 to 65535; or line integrals, which are
-                floats without a flat image. They are kept as counts of an open beam of 60000, or
-                down to 20000 where pixels are brighter than it; a warning says how many are beyond
-                what that holds.
+            counts: (n, rows, cols), whole numbers from 0 to 65535; with a flat image also images
+                of any other scale, such as floats, or what lies below 0 after a dark image was
+                subtracted; or line integrals, which are floats without a flat image. What is no
+                counts is kept as counts of an open beam of 60000, or down to 20000 where pixels
+                are brighter than it; a warning says how many are beyond what that holds.
             geometry: one view for each image.
             dark, flat: (rows, cols), or several images (k, rows, cols), of which the mean is taken.
                 Without a flat image, counts have no line integrals.
@@ -159,19 +160,21 @@ class ImageSet:
         values = np.asarray(counts)
         if values.ndim != 3 or 0 in values.shape:
             raise DatasetFormatError.of_shape("counts", values.shape, ("n", "rows", "cols"))
+        if flat is not None and values.dtype.kind in "fiu" and not _are_counts(values):
+            values = _normalised(values, dark, flat)
+            flat = None
         if values.dtype.kind == "f" and flat is None:
             values, opened, lost = _counts_of(values)
             dark, flat = np.zeros(values.shape[1:]), np.full(values.shape[1:], opened)
             warnings = [*lost, *warnings]
         if values.dtype != np.uint16:
-            whole_numbers = values.astype(np.uint16)
-            if not np.array_equal(whole_numbers, values):
+            if not _are_counts(values):
                 raise DatasetFormatError(
                     f"counts of {values.dtype} from {values.min():g} to {values.max():g}; allowed: "
                     "whole numbers from 0 to 65535",
                     {"asked": str(values.dtype), "allowed": "uint16"},
                 )
-            values = whole_numbers
+            values = values.astype(np.uint16)
         cone = geometry if isinstance(geometry, ConeVec) else ConeVec(np.asarray(geometry))
         shape = cone.of_shape((values.shape[1], values.shape[2]))
         if len(cone) != len(values):
@@ -456,6 +459,22 @@ class ImageSet:
                 {"path": self.where, "missing": list(self.missing[:100])},
             )
         return self
+
+
+def _are_counts(values: npt.NDArray[Any]) -> bool:
+    """Whether values are whole numbers from 0 to 65535."""
+    top = np.iinfo(np.uint16).max
+    return bool(((values >= 0) & (values <= top) & (values == np.rint(values))).all())
+
+
+def _normalised(
+    values: npt.NDArray[Any], dark: npt.ArrayLike | None, flat: npt.ArrayLike
+) -> Float32Array:
+    """Line integrals of images that are no counts, by their dark and flat images."""
+    shape = values.shape[1], values.shape[2]
+    darks, flats = _several("dark", dark, shape), _several("flat", flat, shape)
+    opened = np.zeros(shape) if flats is None else flats.mean(axis=0)
+    return of_intensities(values, 0.0 if darks is None else darks.mean(axis=0), opened)
 
 
 def _counts_of(integrals: npt.NDArray[Any]) -> tuple[Counts, float, list[str]]:

@@ -29,6 +29,7 @@ from flexdt.runtime.files.dataset_folder import (
 from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetFormatError, DatasetMissingError
 from flexdt.twin.dataset.file_names import DOCUMENT, GEOMETRY, SCAN_SETTINGS, XRE_SETTINGS
 from flexdt.twin.dataset.flexdt_json import parse_document
+from flexdt.twin.dataset.normalise import of_intensities
 from flexdt.twin.dataset.rebuild import rebuild
 from flexdt.twin.dataset.scan_settings import ScanSettings
 from flexdt.twin.dataset.scan_settings_text import parse_scan_settings
@@ -165,8 +166,7 @@ def _of_floats(
     if flats:
         dark = np.mean([read_values(folder / n) for n in darks], axis=0) if darks else 0.0
         flat = np.mean([read_values(folder / n) for n in flats], axis=0)
-        images = (images - dark) / np.maximum(flat - dark, 1e-6 * flat.max())
-        images = -np.log(np.maximum(images, np.finfo(np.float32).tiny))
+        images = of_intensities(images, dark, flat)
     return DataSet.from_arrays(images, geometry, name=folder.name)
 
 
