@@ -39,6 +39,8 @@ Shape = tuple[int, int]
 MAX_TEXT_BYTES: Final = 1 << 30
 MAX_IMAGE_BYTES: Final = 1 << 29
 """Of one image; the largest detector of a machine file of ours has 6 MB."""
+BLANK_SAMPLE: Final = 4096
+"""Bytes in the middle of an image's file by which it is found to hold something."""
 _IMAGE: Final = re.compile(r"(di|io|scan)[_-]?(\d+)\.tiff?", re.IGNORECASE)
 
 
@@ -127,13 +129,33 @@ class Folder:
     def _find(self, wanted: str) -> str | None:
         return next((n for n in sorted(self.names) if n.lower() == wanted.lower()), None)
 
+    @cached_property
+    def duplicate(self) -> tuple[str, str] | None:
+        """Two images of one kind and number, if there are such."""
+        return next((two for _, two in self._numbered.values() if two is not None), None)
+
     def _images(self, prefix: str) -> dict[int, str]:
-        found = {}
-        for name in self.names:
+        return self._numbered[prefix][0]
+
+    @cached_property
+    def _numbered(self) -> dict[str, tuple[dict[int, str], tuple[str, str] | None]]:
+        """Of each kind, number -> name in order, of two names with one number the first; and two
+        such names.
+        """
+        found: dict[str, dict[int, str]] = {prefix: {} for prefix in ("di", "io", "scan")}
+        twice: dict[str, tuple[str, str]] = {}
+        for name in sorted(self.names):
             match = _IMAGE.fullmatch(name)
-            if match is not None and match[1].lower() == prefix:
-                found[int(match[2])] = name
-        return dict(sorted(found.items()))
+            if match is None:
+                continue
+            prefix, number = match[1].lower(), int(match[2])
+            first = found[prefix].setdefault(number, name)
+            if first != name:
+                twice.setdefault(prefix, (first, name))
+        return {
+            prefix: (dict(sorted(images.items())), twice.get(prefix))
+            for prefix, images in found.items()
+        }
 
 
 _confined: Directory | None = None
@@ -318,6 +340,30 @@ def _check_inflation(path: Path, raw: BinaryIO, page: Any, size: int) -> None:
             raise ds.DatasetFormatError(
                 f"{path} inflates to more than its {size} bytes of pixels", {"path": str(path)}
             )
+
+
+def blank_images(folder: Folder, names: Sequence[str]) -> tuple[str, ...]:
+    """Those of the images that hold nothing but zeros; none if the last one holds more.
+
+    They are what a scan that was stopped leaves of files that were made in advance.
+    """
+    there = [name for name in names if name in folder.names]
+    if not there or not _blank(folder.path / there[-1]):
+        return ()
+    return tuple(name for name in there if _blank(folder.path / name))
+
+
+def _blank(path: Path) -> bool:
+    """Whether all pixels of an image are zero; a sample of the file decides for most."""
+    try:
+        with opened(path) as file:
+            size = os.fstat(file.fileno()).st_size
+            file.seek(size // 2)
+            if size > 4 * BLANK_SAMPLE and any(file.read(BLANK_SAMPLE)):
+                return False
+        return not read_values(path).any()
+    except (OSError, ds.DatasetError):
+        return False  # who reads it is told
 
 
 def mean_image(paths: Sequence[Path], shape: tuple[int, int]) -> Float32Array:

@@ -13,6 +13,8 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.plausibility.findings import Finding, Severity
 
+SOME_VIEWS: Final = 16
+"""Views whose panels are looked at."""
 WIDEST_DEG: Final = 120.0
 """Angle under which no source sees a whole panel."""
 MOST_PITCH: Final = 0.5
@@ -73,8 +75,12 @@ def geometry_findings(cone_vec: ConeVec, shape: tuple[int, int] | None) -> Itera
     """
     if not len(cone_vec):
         return
-    distance = np.abs(cone_vec.source_detector_distance)
-    pitch = np.maximum(np.linalg.norm(cone_vec.u, axis=1), np.linalg.norm(cone_vec.v, axis=1))
+    normal = np.cross(cone_vec.u, cone_vec.v)
+    with np.errstate(all="ignore"):
+        beam = np.einsum("ni,ni->n", cone_vec.detector - cone_vec.source, normal)
+        distance = np.nan_to_num(np.abs(beam) / np.sqrt(np.einsum("ni,ni->n", normal, normal)))
+    edges = (np.einsum("ni,ni->n", edge, edge) for edge in (cone_vec.u, cone_vec.v))
+    pitch = np.sqrt(np.maximum(*edges))
     worst = int(np.argmax(pitch - MOST_PITCH * distance))
     if pitch[worst] > MOST_PITCH * distance[worst]:
         cause = (
@@ -87,7 +93,7 @@ def geometry_findings(cone_vec: ConeVec, shape: tuple[int, int] | None) -> Itera
         return
     if shape is None:
         return
-    ends = cone_vec.rays(shape)
+    ends = cone_vec[:: -(-len(cone_vec) // SOME_VIEWS)].rays(shape)
     across = (shape[1] - 1) * ends[:, 6:9]
     first = ends[:, 3:6] + 0.5 * (shape[0] - 1) * ends[:, 9:12]
     last = first + across

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import fnmatch
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Final
@@ -18,7 +19,7 @@ import numpy.typing as npt
 
 from flexdt.library.data_set import DataSet
 from flexdt.library.reading.foreign_files import open_file
-from flexdt.library.reading.listed_images import NO_DARK, by_numbers, listed
+from flexdt.library.reading.listed_images import NO_DARK, in_order, listed
 from flexdt.runtime.files.dataset_folder import (
     Folder,
     list_folder,
@@ -45,6 +46,8 @@ from flexdt.twin.machine.description import (
     builtin_profile,
     builtin_profiles,
 )
+from flexdt.twin.plausibility import settled
+from flexdt.twin.plausibility.image_order import duplicate
 from flexdt.twin.signatures import public
 
 AGREE_MM: Final = 1e-6
@@ -128,7 +131,7 @@ def read_tiffs(
         ((3, 4, 5), 0.6931)
     """
     content = list_folder(Path(folder))
-    names = sorted(content.names, key=by_numbers)
+    names = sorted(content.names)
     darks, flats = (fnmatch.filter(names, pattern) for pattern in (dark, flat))
     others = {*darks, *flats}
     chosen = [n for n in fnmatch.filter(names, frames) if n not in others]
@@ -142,9 +145,11 @@ def read_tiffs(
     if isinstance(geometry, str | PathLike):
         geometry = ConeVec.load(geometry, shape=first.shape)
     cone = geometry if isinstance(geometry, ConeVec) else ConeVec(np.asarray(geometry))
+    chosen, doubts = in_order(content, chosen, len(cone))
     if first.dtype != np.uint16:
-        return _of_floats(content.path, cone, chosen, darks, flats)
-    return listed(content, cone, chosen, darks, flats)
+        made = _of_floats(content.path, cone, chosen, darks, flats)
+        return replace(made, warnings=(*made.warnings, *doubts))
+    return listed(content, cone, chosen, darks, flats, warnings=doubts)
 
 
 def _of_floats(
@@ -214,6 +219,7 @@ def _from_document(content: Folder, machine: Machine | None, profile: Profile | 
 
 def _from_geometry(content: Folder) -> DataSet:
     """What `DataSet.save` wrote for a scan without a machine: images and their geometry."""
+    _require_one_each(content)
     path = content.path / GEOMETRY
     geometry = read_geometry_text(read_text(path), str(path))
     names = geometry.files or [content.projection_name(i) for i in range(len(geometry))]
@@ -229,6 +235,7 @@ def _from_texts(content: Folder, machine: Machine | None, profile: Profile | Non
             f"{content.path}: no projections (scan_000000.tif ...)",
             {"path": str(content.path), "missing": ["scan_000000.tif"]},
         )
+    _require_one_each(content)
     warnings: list[str] = []
     settings = read_settings(content, warnings)
     if settings is None:
@@ -293,6 +300,16 @@ def read_settings(content: Folder, warnings: list[str]) -> ScanSettings | None:
         raise errors[0]
     warnings += [e.message for e in errors]
     return None
+
+
+def _require_one_each(content: Folder) -> None:
+    """Check that no two images have one number.
+
+    Raises:
+        DatasetFormatError: names two that have.
+    """
+    if content.duplicate is not None:
+        settled([duplicate(*content.duplicate)], DatasetFormatError, str(content.path))
 
 
 def _require_one_circle(content: Folder) -> None:

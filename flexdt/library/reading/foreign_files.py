@@ -12,6 +12,7 @@ from typing import Final
 
 from flexdt.library.data_set import DataSet
 from flexdt.library.datasets.exchange_formats import FORMATS
+from flexdt.library.reading.foreign_parsing import parsing
 from flexdt.library.reading.nikon_reading import read_nikon
 from flexdt.library.reading.nxtomo_reading import read_nxtomo
 from flexdt.library.reading.zeiss_reading import read_zeiss
@@ -51,7 +52,8 @@ def open_file(path: Path, geometry: ConeVec | None) -> DataSet:
     ending = path.suffix.lower()
     for form in SCAN_FORMATS:
         if ending in form.endings:
-            return form.read(path, geometry)
+            with parsing(path, form.name):
+                return form.read(path, geometry)
     listed = ", ".join(f"{form.name} ({', '.join(form.endings)})" for form in SCAN_FORMATS)
     raise DatasetFormatError(
         f"{path} is a file; allowed: a folder, {listed}; else TIFFs with a geometry, "

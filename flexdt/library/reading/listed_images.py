@@ -2,23 +2,56 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 from flexdt.library.data_set import DataSet
-from flexdt.runtime.files.dataset_folder import Folder, Frame, read_image
+from flexdt.runtime.files.dataset_folder import Folder, Frame, blank_images, read_image
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetMissingError
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.plausibility import Operation, examine, settled
+from flexdt.twin.plausibility.image_order import ordered, other_name
 
 NO_DARK: Final = "no dark image"
 
 
-def by_numbers(name: str) -> list[tuple[int, str]]:
-    """Order of names in which 10 comes after 9."""
-    parts = re.split(r"(\d+)", name)
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
+def in_order(content: Folder, names: Sequence[str], views: int) -> tuple[list[str], list[str]]:
+    """Images in the order of the numbers in their names.
+
+    Args:
+        content: where they are.
+        names: of the images.
+        views: that the geometry has.
+
+    Returns:
+        The names; those that are written otherwise than the rest are left out where there are as
+        many views as others. And what is doubtful about them.
+
+    Raises:
+        DatasetFormatError: two have one number.
+    """
+    found = ordered(names)
+    kept, told = [*found.names], settled(found.findings, DatasetFormatError, str(content.path))
+    if found.others:
+        doubt = other_name(found.others, kept)
+        without = [name for name in kept if name not in found.others]
+        if len(without) == views:
+            doubt = replace(doubt, remedy=f"left out: there are {views} views")
+            kept = without
+        told += settled([doubt], where=str(content.path))
+    return kept, told
+
+
+def doubts_of(content: Folder, geometry: ConeVec, shape: tuple[int, int]) -> list[str]:
+    """What is doubtful about the geometry of images.
+
+    Raises:
+        DatasetFormatError: no scanner has it.
+    """
+    found = examine(Operation.OPEN, geometry, shape)
+    return settled(found, DatasetFormatError, str(content.path)) if found else []
 
 
 def listed(
@@ -61,7 +94,10 @@ def listed(
         rows, cols = read_image(content.path / there[0]).shape
         geometry = geometry.with_shape(geometry.of_shape((rows, cols)))
         shapes = [(rows, cols)] * len(names)
-    reasons = [reason for reason in (*reasons, content.lost((*darks, *flats, *names))) if reason]
+    warnings = [*warnings, *doubts_of(content, geometry, shapes[0])]
+    lost, blank = content.lost((*darks, *flats, *names)), blank_images(content, names)
+    reasons = [reason for reason in (*reasons, lost, nothing_in(blank)) if reason]
+    content = replace(content, names=content.names.difference(blank))
     return DataSet(
         name or content.path.name,
         content.frames(names, shapes),
@@ -75,6 +111,15 @@ def listed(
         warnings=(*warnings, *([] if darks else [f"{NO_DARK} (di000000.tif): zero is taken"])),
         **known,
     )
+
+
+def nothing_in(blank: Sequence[str]) -> str:
+    """Why images without anything recorded make a scan incomplete; "" where there are none."""
+    if not blank:
+        return ""
+    more = f" to {blank[-1]}" if len(blank) > 1 else ""
+    many = f"{len(blank)} projections, {blank[0]}{more}, are" if more else f"{blank[0]} is"
+    return f"{many} zero everywhere: nothing was recorded"
 
 
 def markers_alone(geometry: ConeVec, name: str) -> DataSet:

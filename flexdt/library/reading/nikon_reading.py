@@ -8,20 +8,32 @@ axis stands `ObjectOffsetX` to the left of the line from the source to the panel
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
 from flexdt.library.data_set import DataSet
 from flexdt.library.datasets.image_set import Arrays
-from flexdt.library.reading.listed_images import by_numbers, listed
-from flexdt.runtime.files.dataset_folder import list_folder
+from flexdt.library.reading.foreign_parsing import head_text
+from flexdt.library.reading.listed_images import NO_DARK, listed
+from flexdt.runtime.files.dataset_folder import Folder, list_folder
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray, rotation_z
+from flexdt.twin.plausibility import settled
+from flexdt.twin.plausibility.image_order import ordered
+from flexdt.twin.plausibility.scan_geometry import distance_findings
+
+LINE: Final = re.compile(r"^[ \t]*(\w+)[ \t]*=[ \t]*(.*?)\s*$", re.MULTILINE)
+PROJECTION: Final = re.compile(r"(.*?)(\d+)(\.tiff?)", re.IGNORECASE)
+MOST_VIEWS: Final = 1_000_000
+DECIMAL_COMMA: Final = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
+"""A number as programs of some countries write it."""
 
 
 def read_nikon(path: Path, geometry: ConeVec | None) -> DataSet:
@@ -34,11 +46,17 @@ def read_nikon(path: Path, geometry: ConeVec | None) -> DataSet:
     Raises:
         DatasetError: the file lacks what is needed, or images are missing or of another shape.
     """
-    said = dict(re.findall(r"^(\w+)=(.*?)\s*$", path.read_text("utf-8", "replace"), re.MULTILINE))
+    said = dict(LINE.findall(head_text(path)))
     views = int(_number(path, said, "Projections"))
     sod, sdd = (_number(path, said, key) for key in ("SrcToObject", "SrcToDetector"))
     across, down = (_number(path, said, f"DetectorPixelSize{axis}") for axis in "XY")
+    impossible = distance_findings(sod, sdd, (across, down), ("SrcToObject", "SrcToDetector"))
+    if geometry is None:
+        settled(impossible, DatasetFormatError, str(path))
     size = [int(_number(path, said, f"DetectorPixels{axis}")) for axis in "YX"]
+    if not 0 < views <= MOST_VIEWS:
+        raise DatasetFormatError.instead(f"{path}: Projections is {views}", views,
+                                         f"1 to {MOST_VIEWS}")  # fmt: skip
     top, bottom = (_number(path, said, f"CentreOfRotation{end}", 0.0) for end in ("Top", "Bottom"))
     aside = _number(path, said, "ObjectOffsetX", 0.5 * (top + bottom) * sod / sdd)
     lean = -np.rad2deg(np.arctan2(top - bottom, size[0] * down))
@@ -50,9 +68,8 @@ def read_nikon(path: Path, geometry: ConeVec | None) -> DataSet:
     place = np.array([[aside, -sod, 0.0], [aside, sdd - sod, 0.0], [-across, 0, 0], [0, 0, -down]])
     rows = (place @ _axis(*np.deg2rad(tilts)))[None] @ rotation_z(-turn)
     folder = list_folder(path.parent / said.get("InputFolderName", "").replace("\\", "/"))
-    names = sorted((n for n in folder.names if n.lower().endswith((".tif", ".tiff"))),
-                   key=by_numbers)  # fmt: skip
     cone = ConeVec(rows.reshape(views, 12)) if geometry is None else geometry
+    names, told = _images(folder, len(cone))
     data = listed(folder, cone, names, (), (), said.get("Name", ""))
     if list(data.shape) != size:
         raise DatasetFormatError(
@@ -60,12 +77,40 @@ def read_nikon(path: Path, geometry: ConeVec | None) -> DataSet:
             f"{data.shape[1]} x {data.shape[0]}", {"asked": size, "allowed": list(data.shape)},
         )  # fmt: skip
     white = np.full((1, *data.shape), _number(path, said, "WhiteLevel"), np.float32)
-    doubts = [
+    doubts = told + [
         f"{path.name} states {key} {said[key]}, which is not applied"
-        for key in ("DetectorOffsetX", "DetectorOffsetY") if float(said.get(key, 0.0) or 0.0)
+        for key in ("DetectorOffsetX", "DetectorOffsetY") if _number(path, said, key, 0.0)
     ]  # fmt: skip
     arrays = Arrays(None, np.zeros_like(white), white)
-    return replace(data, arrays=arrays, warnings=tuple(doubts))
+    more = [doubt for doubt in data.warnings if not doubt.startswith(NO_DARK)]
+    return replace(data, arrays=arrays, warnings=(*more, *doubts))
+
+
+def _images(folder: Folder, views: int) -> tuple[list[str], list[str]]:
+    """The names of the projections by their numbers, lost ones among them; and what is doubtful.
+
+    Raises:
+        DatasetFormatError: two have one number.
+    """
+    images = [name for name in folder.names if name.lower().endswith((".tif", ".tiff"))]
+    found = ordered(images)
+    told = settled(
+        [one for one in found.findings if one.kind != "gap"], DatasetFormatError, str(folder.path)
+    )
+    if found.others:
+        told.append(f"{', '.join(found.others)} are no projections by their names: left out")
+    names = [name for name in found.names if name not in found.others]
+    parts = [PROJECTION.fullmatch(name) for name in names]
+    numbers = {int(part[2]): part for part in parts if part is not None}
+    if len(numbers) < len(names) or len(names) >= views or not names:
+        return names, told
+    first, last = min(numbers), max(numbers)
+    start = next((at for at in (1, 0, first) if at <= first and last < at + views), None)
+    if start is None:
+        return names, told
+    before, digits, after = numbers[first].groups()
+    width = len(digits) if digits.startswith("0") else 1
+    return [f"{before}{n:0{width}d}{after}" for n in range(start, start + views)], told
 
 
 def _number(path: Path, said: Mapping[str, str], key: str, default: float | None = None) -> float:
@@ -73,11 +118,14 @@ def _number(path: Path, said: Mapping[str, str], key: str, default: float | None
     try:
         if not text and default is not None:
             return default
-        return float(text)
+        value = float(text.replace(",", ".", 1) if DECIMAL_COMMA.fullmatch(text) else text)
     except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
         raise DatasetFormatError(
-            f"{path}: {key} is {text or 'missing'}; allowed: a number", {"missing": key}
-        ) from None
+            f"{path}: {key} is {text[:60] or 'missing'}; allowed: a number", {"missing": key}
+        )
+    return value
 
 
 def _axis(roll: float, tilt: float) -> FloatArray:

@@ -1,0 +1,67 @@
+"""Parse other programs' files: every error is the file's, with its name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+from flexdt.runtime.files.directory import memory_bytes
+from flexdt.twin.dataset.dataset_errors import DatasetFormatError
+from flexdt.twin.errors import TwinError
+
+MAX_HEAD_BYTES: Final = 16 << 20
+"""Of a text that describes a scan."""
+TOLD: Final = 200
+"""Characters of a parser's own words that a message repeats."""
+
+
+@contextmanager
+def parsing(path: Path, form: str) -> Iterator[None]:
+    """Turn what a parser raises into the file's error.
+
+    Args:
+        path: the file.
+        form: whose format it should have.
+
+    Raises:
+        DatasetFormatError: anything was raised but a TwinError.
+    """
+    try:
+        yield
+    except TwinError:
+        raise
+    except MemoryError:
+        said = f"{path} takes more memory than there is"
+        raise DatasetFormatError(said, {"path": str(path)}) from None
+    except Exception as error:  # A third party's parser on a damaged file: anything may come.
+        words = " ".join(str(error).split())[:TOLD] or type(error).__name__
+        said = f"{path} is no {form} file, or a damaged one ({words})"
+        raise DatasetFormatError(said, {"path": str(path)}) from error
+
+
+def head_text(path: Path, most: int = MAX_HEAD_BYTES) -> str:
+    """A text that describes a scan, as UTF-8 with or without a byte order mark.
+
+    Raises:
+        DatasetFormatError: it has more than `most` bytes.
+        OSError: it cannot be read.
+    """
+    size = path.stat().st_size
+    if size > most:
+        said = f"{path} has {size} bytes"
+        raise DatasetFormatError.instead(said, size, f"{most} bytes of text", path=str(path))
+    return path.read_text("utf-8-sig", "replace")
+
+
+def require_memory(path: Path, what: str, size: int) -> None:
+    """Refuse what is to be read whole and does not fit into memory.
+
+    Raises:
+        DatasetFormatError: it does not.
+    """
+    most = memory_bytes()
+    if size > most:
+        said = f"{path} claims {what} of {size / 2**30:.4g} GiB"
+        raise DatasetFormatError.instead(said, size, f"{most / 2**30:.4g} GiB", path=str(path))

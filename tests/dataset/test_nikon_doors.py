@@ -1,0 +1,80 @@
+"""What a Nikon folder may contradict: distances, numbers as text, lost images, previews."""
+
+import numpy as np
+import pytest
+import tifffile
+
+import flexdt as fx
+from flexdt.twin.dataset.dataset_errors import DatasetError
+
+VIEWS, SHAPE = 8, (6, 9)
+
+
+def xtekct(folder, said=None, before="", names=None):
+    names = [f"part_{i + 1:04d}.tif" for i in range(VIEWS)] if names is None else names
+    for i, name in enumerate(names):
+        tifffile.imwrite(folder / name, np.full(SHAPE, 100 + i, np.uint16))
+    lines = {
+        "Name": "part", "Projections": VIEWS, "WhiteLevel": 1000, "DetectorPixelsX": SHAPE[1],
+        "DetectorPixelsY": SHAPE[0], "DetectorPixelSizeX": 0.2, "DetectorPixelSizeY": 0.2,
+        "SrcToObject": 100.5, "SrcToDetector": 400.25, "InitialAngle": 0.0, "AngularStep": 45.0,
+        "InputFolderName": "", **(said or {}),
+    }  # fmt: skip
+    path = folder / "part.xtekct"
+    text = "[XTekCT]\r\n" + "".join(f"{key}={value}\r\n" for key, value in lines.items())
+    path.write_text(before + text)
+    return path
+
+
+@pytest.mark.parametrize(
+    "said",
+    [{"SrcToObject": 0}, {"SrcToObject": 500}, {"SrcToObject": -100}, {"SrcToDetector": 0},
+     {"DetectorPixelSizeX": 0}, {"DetectorPixelSizeY": -0.2}, {"SrcToDetector": "inf"},
+     {"SrcToObject": "nan"}, {"DetectorPixelSizeX": 300}, {"Projections": 1e30},
+     {"Projections": -3}, {"SrcToObject": "1e999"}, {"AngularStep": "9" * 5000}],
+)  # fmt: skip
+def test_impossible_numbers_are_refused(tmp_path, said):
+    path = xtekct(tmp_path, said)
+    with pytest.raises(DatasetError, match=r"part\.xtekct"):
+        fx.open(path)
+
+
+@pytest.mark.parametrize(("before", "said"), [
+    ("", {"SrcToObject": "100,5", "SrcToDetector": "400,25"}), ("\ufeff", {}),
+    ("; a comment\n\n", {}), ("", {"SrcToObject ": "\t100.5"}),
+])  # fmt: skip
+def test_numbers_as_some_countries_write_them_are_read(tmp_path, before, said):
+    data = fx.open(xtekct(tmp_path, said, before))
+    assert np.linalg.norm(data.geometry.source[0]) == pytest.approx(100.5)
+
+
+@pytest.mark.parametrize("lost", [1, 4, VIEWS])
+@pytest.mark.parametrize("preview", [True, False])
+def test_a_lost_image_shifts_no_view(tmp_path, lost, preview):
+    names = [f"part_{i + 1:04d}.tif" for i in range(VIEWS)]
+    path = xtekct(tmp_path, names=names)
+    (tmp_path / names[lost - 1]).unlink()
+    if preview:
+        tifffile.imwrite(tmp_path / "part_preview.tif", np.zeros(SHAPE, np.uint16))
+    data = fx.open(path)
+    assert not data.complete
+    assert data.missing == (names[lost - 1],)
+    assert [int(data.counts(i)[0, 0]) for i in data.present] == [
+        100 + i for i in range(VIEWS) if i != lost - 1
+    ]
+
+
+def test_a_preview_is_left_out(tmp_path):
+    path = xtekct(tmp_path)
+    tifffile.imwrite(tmp_path / "preview.tif", np.full(SHAPE, 1, np.uint16))
+    data = fx.open(path)
+    assert (len(data), data.complete) == (VIEWS, True)
+    assert any("preview.tif" in doubt for doubt in data.warnings)
+
+
+def test_a_text_of_any_length_is_refused(tmp_path, monkeypatch):
+    path = xtekct(tmp_path)
+    with path.open("ab") as file:
+        file.truncate(17 << 20)
+    with pytest.raises(DatasetError, match="bytes of text"):
+        fx.open(path)

@@ -1,0 +1,199 @@
+"""The order in which image files belong, by the numbers in their names, and what is wrong with it.
+
+Names hold whole numbers, decimals, negative numbers or angles (`p_0.25`, `a-10`, `x_180deg`). How
+they are written is found from all names together: 1.10 follows 1.9 where 1.1 is there, too.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from flexdt.twin.plausibility.findings import Finding, Severity
+
+NUMBER: Final = re.compile(r"(?P<sign>[-+]?)(?P<whole>\d+)(?P<part>\.\d+)?")
+SIGNED_AFTER: Final = frozenset("_ =(,")
+"""Characters, or the name's beginning, after which a hyphen is a minus sign."""
+MOST_OTHERS: Final = 0.1
+"""Share of names, or two of them, that may be written otherwise than the rest by mistake."""
+EVEN: Final = 0.8
+"""Share of steps between numbers that are alike where a missing number is a gap."""
+TOLD: Final = 3
+"""Names that a message repeats."""
+Key = tuple[str | float, ...]
+"""Texts and numbers of a name in turn, beginning with a text."""
+
+
+@dataclass(frozen=True)
+class Ordered:
+    """Names in order.
+
+    Attributes:
+        names: in the order of their numbers.
+        findings: what is wrong with them.
+        others: of `names`, those that are written otherwise than the rest.
+    """
+
+    names: tuple[str, ...]
+    findings: tuple[Finding, ...] = ()
+    others: tuple[str, ...] = ()
+
+
+def ordered(names: Sequence[str]) -> Ordered:
+    """Put the names of images in order.
+
+    Example:
+        >>> ordered(["p_0.5.tif", "p_0.25.tif", "p_-1.tif"]).names
+        ('p_-1.tif', 'p_0.25.tif', 'p_0.5.tif')
+        >>> ordered(["a10.tif", "a9.tif"]).names
+        ('a9.tif', 'a10.tif')
+    """
+    known = sorted(set(names))
+    if (evenly := _numbered(known)) is not None:
+        return evenly
+    keys = _keys(known)
+    sorted_names = tuple(sorted(known, key=lambda name: (keys[name], name)))
+    others = _written_otherwise(sorted_names, keys)
+    rest = [name for name in sorted_names if name not in others]
+    found = [*_duplicates(sorted_names, keys), *_gaps(rest, keys)]
+    return Ordered(sorted_names, tuple(found), others)
+
+
+def _numbered(names: list[str]) -> Ordered | None:
+    """Sorted names that differ by a whole number of fixed width alone, without a gap; else None."""
+    if len(names) < 2 or len({*map(len, names)}) != 1:
+        return None
+    first, last = names[0], names[-1]
+    at = next(i for i, (a, b) in enumerate(zip(first, last, strict=True)) if a != b)
+    start = len(first[:at].rstrip("0123456789"))
+    end = start + len(first[start:]) - len(first[start:].lstrip("0123456789"))
+    before, after = first[:start], first[end:]
+    if end == start or before.endswith(("-", "+", ".")) or NUMBER.match(after[:2].lstrip(".")):
+        return None
+    parts = [name[start:end] for name in names]
+    if not all(map(str.isdigit, parts)):
+        return None
+    if not all(n.startswith(before) and n.endswith(after) for n in names):
+        return None
+    numbers = [*map(int, parts)]
+    step, rest = divmod(numbers[-1] - numbers[0], len(names) - 1)
+    even = not rest and numbers == [*range(numbers[0], numbers[-1] + 1, step)]
+    return Ordered(tuple(names)) if even else None
+
+
+def other_name(others: Sequence[str], names: Sequence[str]) -> Finding:
+    """Tell of names that are written otherwise than those of the other images."""
+    like = next(name for name in names if name not in others)
+    told = ", ".join(others[:TOLD])
+    cause = f"{told} {_is(others)} named otherwise than the rest, such as {like}"
+    remedy = "frames=PATTERN says which are projections"
+    return Finding("other name", cause, remedy, Severity.WARNING, float(len(others)))
+
+
+def duplicate(one: str, other: str) -> Finding:
+    """Refuse two files with one number."""
+    cause = f"{one} and {other} have one number: which of them is meant is not known"
+    return Finding("duplicate", cause, "allowed: one file a number", Severity.REFUSAL, 2.0)
+
+
+def _is(names: Sequence[str]) -> str:
+    return "is" if len(names) == 1 else "are"
+
+
+def _keys(names: Sequence[str]) -> dict[str, Key]:
+    """What names are sorted by: their text with the numbers left out, and these."""
+    stems = {name: re.sub(r"\.[A-Za-z]\w*$", "", name) for name in names}
+    plain = {name: _key(stem, signed=False, decimals=False) for name, stem in stems.items()}
+    signs = {name: _key(stem, signed=True, decimals=False) for name, stem in stems.items()}
+    # A hyphen that only some names have is a sign; one that all have separates.
+    signed = len(_texts(signs)) < len(_texts(plain))
+    whole = signs if signed else plain
+    decimal = {name: _key(stem, signed=signed, decimals=True) for name, stem in stems.items()}
+    return decimal if _decimal(decimal, whole, stems) else whole
+
+
+def _texts(keys: dict[str, Key]) -> set[str]:
+    return {_text(key) for key in keys.values()}
+
+
+def _text(key: Key) -> str:
+    return "#".join(map(str, key[::2]))
+
+
+def _numbers(key: Key) -> tuple[float, ...]:
+    return tuple(float(number) for number in key[1::2])
+
+
+def _key(stem: str, *, signed: bool, decimals: bool) -> Key:
+    parts: list[str | float] = []
+    at = 0
+    for match in NUMBER.finditer(stem):
+        before = stem[match.start() - 1] if match.start() else ""
+        sign, whole, part = match["sign"], match["whole"], match["part"] or ""
+        minus = sign and (signed or not before or before in SIGNED_AFTER)
+        value = float(whole + part) if decimals else float(whole)
+        parts.append(stem[at : match.start()] + ("" if minus else sign))
+        parts.append(-value if minus and sign == "-" else value)
+        if part and not decimals:
+            parts += [".", float(part[1:])]
+        at = match.end()
+    return (*parts, stem[at:])
+
+
+def _decimal(decimal: dict[str, Key], whole: dict[str, Key], stems: dict[str, str]) -> bool:
+    """Whether points in names are decimal points and not between two numbers."""
+    if len(set(decimal.values())) < len(set(whole.values())):
+        return len(_texts(decimal)) < len(_texts(whole))
+    parts = [m["part"][1:] for s in stems.values() for m in NUMBER.finditer(s) if m["part"]]
+    if not parts:
+        return False
+    widths = {len(part) for part in parts}
+    return len(widths) == 1 or not any(len(p) > 1 and p.endswith("0") for p in parts)
+
+
+def _written_otherwise(names: Sequence[str], keys: dict[str, Key]) -> tuple[str, ...]:
+    """Names of which only a few have their text, among many that share one."""
+    texts = Counter(_text(keys[name]) for name in names)
+    usual, most = texts.most_common(1)[0] if texts else ("", 0)
+    few = [name for name in names if _text(keys[name]) != usual]
+    if most < 4 or not 0 < len(few) <= max(2.0, MOST_OTHERS * len(names)):
+        return ()
+    return tuple(few)
+
+
+def _duplicates(names: Sequence[str], keys: dict[str, Key]) -> Iterator[Finding]:
+    seen: dict[Key, str] = {}
+    for name in names:
+        key = keys[name]
+        if key in seen and _numbers(key):
+            yield duplicate(seen[key], name)
+            return
+        seen[key] = name
+
+
+def _gaps(names: Sequence[str], keys: dict[str, Key]) -> Iterator[Finding]:
+    """Find a number that is missing between others of one step."""
+    if len(names) < 4 or len({_text(keys[name]) for name in names}) != 1:
+        return
+    table = np.array([_numbers(keys[name]) for name in names], dtype=np.float64)
+    varying = np.flatnonzero(np.ptp(table, axis=0) > 0)
+    if len(varying) != 1:
+        return
+    steps = np.diff(table[:, varying[0]])
+    usual = float(np.median(steps))
+    wide = np.flatnonzero(steps > 1.5 * usual)
+    alike = np.abs(steps / usual - np.round(steps / usual)) < 1e-3 if usual > 0 else steps < 0
+    if len(wide) and alike.all() and (np.abs(steps - usual) < 0.01 * usual).mean() >= EVEN:
+        at = int(wide[0])
+        lost = int(np.sum(np.round(steps[wide] / usual) - 1))
+        cause = (
+            f"{lost} {'image is' if lost == 1 else 'images are'} missing between {names[at]} and "
+            f"{names[at + 1]}{' and elsewhere' if len(wide) > 1 else ''}"
+        )
+        remedy = "views are taken in the order of the images that are there"
+        yield Finding("gap", cause, remedy, Severity.WARNING, float(lost))
