@@ -21,6 +21,9 @@ from pydantic_core import from_json
 MAX_DEPTH = 200
 """Deepest nesting of a document (the JSON parser's own limit)."""
 
+BYTE_ORDER_MARK = b"\xef\xbb\xbf"
+"""Before JSON it says nothing, and .NET writes it at the beginning of a stream."""
+
 LARGE = 1 << 16
 """Bytes of a binary value that is encoded in pieces."""
 A_PIECE = 3 << 16
@@ -42,7 +45,7 @@ def read_json(data: bytes | bytearray | memoryview) -> object:
     Raises:
         ValueError: says what is wrong and where; a name that an object has twice is, too.
     """
-    raw = bytes(data)
+    raw = bytes(data).removeprefix(BYTE_ORDER_MARK)
     document = from_json(raw, allow_inf_nan=False)
     _NAMES.decode(raw.decode())
     return document

@@ -11,7 +11,6 @@ and extent are bounded.
 
 from __future__ import annotations
 
-import json
 import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
@@ -29,6 +28,7 @@ from flexdt.phantoms.materials import material as material_of
 from flexdt.phantoms.phantom import Phantom, assemble
 from flexdt.phantoms.pieces import size_about_origin
 from flexdt.twin.errors import GeometryError, TwinError
+from flexdt.twin.json_text import BYTE_ORDER_MARK, parse_json
 from flexdt.twin.length_units import UNITS_MM
 from flexdt.twin.projection import TriangleMesh
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Vector
@@ -67,8 +67,9 @@ def load_phantom_file(text: str, file: str = "<phantom>", folder: Path | None = 
         PhantomError: names file, key path, value and what is allowed.
     """
     try:
-        document = json.loads(text) if text.lstrip()[:1] == "{" else tomllib.loads(text)
-    except (json.JSONDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
+        text = text.removeprefix(BYTE_ORDER_MARK)
+        document = parse_json(text) if text.lstrip()[:1] == "{" else tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
         raise PhantomError(f"{file}: not valid TOML or JSON: {error}", {"file": file}) from None
     try:
         return phantom_of(document, folder)

@@ -250,7 +250,7 @@ def read_document(folder: Directory) -> DatasetDocument:
     """
     path = folder.path / DOCUMENT
     try:
-        text = folder.read(DOCUMENT).decode()
+        text = folder.read(DOCUMENT).decode("utf-8-sig")
     except FileNotFoundError:
         raise
     except (OSError, UnicodeDecodeError) as error:

@@ -27,6 +27,7 @@ from flexdt.twin.dataset.file_names import DOCUMENT, plain_name
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.json_text import parse_json
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.machine.kinematics import motor_poses
@@ -520,8 +521,8 @@ def parse_document(text: str, file: str = DOCUMENT) -> DatasetDocument:
         DatasetFormatError: names file, key path, value and what is allowed.
     """
     try:
-        content = json.loads(text)
-    except (json.JSONDecodeError, RecursionError) as error:
+        content = parse_json(text)
+    except ValueError as error:
         raise DatasetFormatError(f"{file} is not valid JSON: {error}", {"path": file}) from None
     if isinstance(content, dict) and content.get("schema") != SCHEMA:
         raise DatasetFormatError(

@@ -21,6 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.json_text import parse_json
 
 VECTOR_NAMES: Final = tuple(f"{part}_{axis}" for part in ("source", "detector", "u", "v")
                             for axis in "xyz")  # fmt: skip
@@ -270,8 +271,8 @@ def read_json(text: str, file: str, kind: type[dict[str, Any]] = dict) -> dict[s
         ExchangeError: not one.
     """
     try:
-        document = json.loads(text, object_pairs_hook=kind)
-    except (ValueError, RecursionError) as error:
+        document = parse_json(text, kind)
+    except ValueError as error:
         raise ExchangeError(f"{file} is not valid JSON: {error}", {"path": file}) from None
     if not isinstance(document, dict):
         raise ExchangeError(f"{file}: not a JSON object", {"path": file})

@@ -7,9 +7,11 @@ from typing import Final
 
 import numpy as np
 
-from flexdt.library.datasets.image_set import Counts, ImageSet
+from flexdt.library.datasets.image_set import Counts, ImageSet, flats_of
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.physics.exposure import FEW_COUNTS, NOTICED
+from flexdt.twin.plausibility import settled
+from flexdt.twin.plausibility.reference_images import beam_findings, flat_findings, open_beam
 
 MAX_FROM_DISK: Final = 32
 """Radiographs in files that are looked at."""
@@ -34,6 +36,8 @@ def image_doubts(
         DatasetFormatError: line integrals are `needed`, and the images hold none: no pixel of the
             flat image is brighter than the dark one, or all are saturated.
     """
+    if scan.arrays is not None and scan.arrays.integrals is not None:
+        return []  # they were given, not exposed
     flat, dark = scan.flat, scan.dark
     alive, wanted = flat > dark, scan.present
     in_files = scan.arrays is None or scan.arrays.counts is None
@@ -49,8 +53,14 @@ def image_doubts(
             top = float(max(flat.max(), max(int(look(i).max()) for i in wanted)))
             top = top if np.log2(top + 1.0).is_integer() else np.inf
         few = dark[alive] + FEW_COUNTS
-        images = (look(i)[alive] for i in wanted)
-        each = [((seen >= top).mean(), (seen < few).mean()) for seen in images]
+        opened = np.where(alive, flat - dark, np.nan)
+        beam: list[float | None] = []
+        each: list[tuple[float, float]] = []
+        for i in wanted:
+            image = look(i)
+            seen = image[alive]
+            each.append(((seen >= top).mean(), (seen < few).mean()))
+            beam.append(open_beam(image, dark, opened))
         saturated, starved = np.mean(each, axis=0)
         shares = {
             "radiographs": float(saturated),
@@ -69,6 +79,9 @@ def image_doubts(
                 f"than {FEW_COUNTS:g} counts of signal), where attenuation is mostly noise: raise "
                 "the tube's power, its voltage or the exposure"
             )
+        if held:
+            compared = *flat_findings(flats_of(scan), dark), *beam_findings(beam)
+            doubts += settled(compared, DatasetFormatError)
     if needed and not held:
         raise DatasetFormatError(
             f"{scan.where}: the images hold no line integrals; {'; '.join(doubts)}",

@@ -28,11 +28,16 @@ from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.panel import Panel
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.description import Machine, Profile
+from flexdt.twin.plausibility import Operation, examine, settled
+from flexdt.twin.plausibility.examination import some_of
+from flexdt.twin.plausibility.pixel_values import integral_findings
 from flexdt.twin.scanner.state import NamedCorrection
 from flexdt.twin.signatures import public
 
 Counts = npt.NDArray[np.uint16]
 OPEN_COUNTS: Final = 60_000.0
+FEWEST_COUNTS: Final = 25
+"""Largest count of an image below which it is doubtful that these are counts."""
 Images = TypeVar("Images", bound="ImageSet")
 """An image set of the kind that was given, such as a `DataSet`."""
 Images_co = TypeVar("Images_co", bound="ImageSet", covariant=True)
@@ -55,11 +60,21 @@ class Arrays:
     Attributes:
         counts: uint16 (n, rows, cols); None where they are files.
         darks, flats: (k, rows, cols), or None where there are none.
+        integrals: line integrals (n, rows, cols) of which counts were made; None where counts were
+            measured.
     """
 
     counts: Counts | CountsReader | None
     darks: npt.NDArray[Any] | None = None
     flats: npt.NDArray[Any] | None = None
+    integrals: Float32Array | None = None
+
+    def of_views(self, chosen: npt.NDArray[np.int64]) -> Arrays:
+        """Those of some of the images."""
+        if self.counts is None:
+            return self
+        kept = None if self.integrals is None else self.integrals[chosen]
+        return replace(self, counts=self.counts[chosen], integrals=kept)
 
 
 @public
@@ -138,9 +153,10 @@ class ImageSet:
         Args:
             counts: (n, rows, cols), whole numbers from 0 to 65535; with a flat image also images
                 of any other scale, such as floats, or what lies below 0 after a dark image was
-                subtracted; or line integrals, which are floats without a flat image. What is no
-                counts is kept as counts of an open beam of 60000, or down to 20000 where pixels
-                are brighter than it; a warning says how many are beyond what that holds.
+                subtracted; or line integrals, which are floats without a flat image. Line
+                integrals are kept as they are, and as counts of an open beam of 60000, or down to
+                20000 where pixels are brighter than it, for what takes counts; a warning says how
+                many are beyond what counts hold.
             geometry: one view for each image.
             dark, flat: (rows, cols), or several images (k, rows, cols), of which the mean is taken.
                 Without a flat image, counts have no line integrals.
@@ -160,13 +176,19 @@ class ImageSet:
         values = np.asarray(counts)
         if values.ndim != 3 or 0 in values.shape:
             raise DatasetFormatError.of_shape("counts", values.shape, ("n", "rows", "cols"))
+        integrals = None
         if flat is not None and values.dtype.kind in "fiu" and not _are_counts(values):
             values = _normalised(values, dark, flat)
             flat = None
         if values.dtype.kind == "f" and flat is None:
+            doubts = settled(integral_findings(some_of(values)), DatasetFormatError, name)
+            integrals = np.asarray(values, dtype=np.float32)
             values, opened, lost = _counts_of(values)
             dark, flat = np.zeros(values.shape[1:]), np.full(values.shape[1:], opened)
-            warnings = [*lost, *warnings]
+            warnings = [*lost, *doubts, *warnings]
+        if values.dtype.kind in "ui" and flat is None and 0 < int(values[0].max()) < FEWEST_COUNTS:
+            doubt = f"whole numbers up to {values[0].max()} without a flat image: counts, or line "
+            warnings = [f"{doubt}integrals whose fractions are cut off?", *warnings]
         if values.dtype != np.uint16:
             if not _are_counts(values):
                 raise DatasetFormatError(
@@ -182,11 +204,16 @@ class ImageSet:
                 f"{len(values)} images and {len(cone)} views; allowed: as many of both",
                 {"asked": len(values), "allowed": len(cone)},
             )
-        arrays = Arrays(values, _several("dark", dark, shape), _several("flat", flat, shape))
+        darks, flats = _several("dark", dark, shape), _several("flat", flat, shape)
+        arrays = Arrays(values, darks, flats, integrals)
+        placed = settled(examine(Operation.OPEN, cone, shape), DatasetFormatError, name)
+        blank = _blank(values)
+        reason = f"{blank.sum()} of {len(values)} images are zero everywhere: nothing was recorded"
         frames = tuple(Frame(i, f"scan_{i:06d}.tif", None, True, shape) for i in range(len(values)))
         told = () if dark is not None else ("no dark image: zero is taken",)
         return cls(name, frames, shape, cone.with_shape(shape), arrays=arrays,
-                   warnings=(*told, *warnings), truth=truth)  # fmt: skip
+                   complete=not blank.any(), reason=reason if blank.any() else "",
+                   warnings=(*told, *placed, *warnings), truth=truth)  # fmt: skip
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -220,9 +247,7 @@ class ImageSet:
             cone_vec=self.cone_vec[chosen],
             nominal=None if self.nominal is None else self.nominal[chosen],
             positions={name: values[chosen] for name, values in self.positions.items()},
-            arrays=arrays
-            if arrays is None or arrays.counts is None
-            else replace(arrays, counts=arrays.counts[chosen]),
+            arrays=None if arrays is None else arrays.of_views(chosen),
             truth=self.truth.of_views(chosen) if hasattr(self.truth, "of_views") else None,
         )
 
@@ -413,14 +438,21 @@ class ImageSet:
         """
         if index is None:
             return self.stack(range(len(self)))
-        image = self.normalisation(self.counts(index))
+        image = self._recorded(index)
         if self.panel is None:
             return image
         index = range(len(self))[index]
         before = self.frames[max(index - 1, 0)]
         if self.panel.lag and before.present and before.index == self.frames[index].index - 1:
-            image = self.panel.without_lag(image, self.normalisation(self.counts(index - 1)))
+            image = self.panel.without_lag(image, self._recorded(index - 1))
         return self.panel.undistorted(image)
+
+    def _recorded(self, index: int) -> Float32Array:
+        """Line integrals of one projection as they were recorded or given, (rows, cols)."""
+        arrays = self.arrays
+        if arrays is None or arrays.integrals is None:
+            return self.normalisation(self.counts(index))
+        return np.array(arrays.integrals[index])
 
     def stack(self, indices: Sequence[int] | None = None) -> Float32Array:
         """Line integrals of several projections (default: all that are there), (n, rows, cols).
@@ -463,6 +495,8 @@ class ImageSet:
 
 def _are_counts(values: npt.NDArray[Any]) -> bool:
     """Whether values are whole numbers from 0 to 65535."""
+    if values.dtype == np.uint16:
+        return True
     top = np.iinfo(np.uint16).max
     return bool(((values >= 0) & (values <= top) & (values == np.rint(values))).all())
 
@@ -475,6 +509,14 @@ def _normalised(
     darks, flats = _several("dark", dark, shape), _several("flat", flat, shape)
     opened = np.zeros(shape) if flats is None else flats.mean(axis=0)
     return of_intensities(values, 0.0 if darks is None else darks.mean(axis=0), opened)
+
+
+def _blank(counts: Counts) -> npt.NDArray[np.bool_]:
+    """Which images (n, rows, cols) are zero everywhere; pixels of one row decide for most."""
+    blank: npt.NDArray[np.bool_] = counts[:, counts.shape[1] // 2, ::41].max(axis=1) == 0
+    for i in np.flatnonzero(blank):
+        blank[i] = not counts[i].any()
+    return blank
 
 
 def _counts_of(integrals: npt.NDArray[Any]) -> tuple[Counts, float, list[str]]:
@@ -493,7 +535,10 @@ def _counts_of(integrals: npt.NDArray[Any]) -> tuple[Counts, float, list[str]]:
     images *= opened
     lost = float(((images < 1.0) | (images > top)).mean())
     held = f"{np.log(opened / top):.3g} to {np.log(opened):.3g}"
-    told = f"{100 * lost:.3g} % of the pixels have line integrals outside {held}: they are cut"
+    told = (
+        f"{100 * lost:.3g} % of the pixels have line integrals outside {held}: they are cut in "
+        "counts, as files have them, and kept in line_integrals()"
+    )
     return np.rint(np.clip(images, 0, top)).astype(np.uint16), opened, [told] if lost else []
 
 
@@ -511,6 +556,14 @@ def _several(
             {"asked": list(values.shape), "allowed": list(shape)},
         )
     return values
+
+
+def flats_of(data: ImageSet) -> npt.NDArray[Any]:
+    """The flat images, (k, rows, cols); of one alone none is read."""
+    if data.arrays is not None and data.arrays.flats is not None:
+        return data.arrays.flats
+    several = data.flats if len(data.flats) > 1 else ()
+    return np.array([read_image(path, data.shape) for path in several])
 
 
 def references(data: ImageSet) -> list[tuple[str, Counts]]:

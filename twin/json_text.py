@@ -1,0 +1,32 @@
+"""JSON as other programs write it: a byte order mark before it, numbers of any length in it."""
+
+from __future__ import annotations
+
+import json
+from typing import Any, Final
+
+BYTE_ORDER_MARK: Final = "\ufeff"
+
+
+def parse_json(text: str, kind: type[dict[str, Any]] = dict) -> Any:
+    """Parse a document.
+
+    Args:
+        text: with or without a byte order mark.
+        kind: of its objects.
+
+    Raises:
+        ValueError: it is none, nests too deep, or holds a number of thousands of digits; says so.
+
+    Example:
+        >>> parse_json("\ufeff[1]")
+        [1]
+    """
+    try:
+        return json.loads(text.removeprefix(BYTE_ORDER_MARK), object_pairs_hook=kind)
+    except json.JSONDecodeError:
+        raise
+    except RecursionError:
+        raise ValueError("it nests too deep") from None
+    except ValueError:  # of int, about how its limit is raised
+        raise ValueError("it holds a whole number of thousands of digits") from None

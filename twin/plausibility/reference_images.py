@@ -1,0 +1,118 @@
+"""Flat images against each other, and against the open beam beside the object."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.plausibility.findings import Finding, Severity
+
+MOST_APART: Final = 0.015
+"""Difference of flat images' levels that is no more than a tube's own unsteadiness."""
+MOST_DRIFT: Final = 0.03
+"""Difference of the open beam and the flat image that scatter or a tube's drift may have."""
+SIGMAS: Final = 6.0
+"""Differences below so many standard deviations are noise."""
+STRIP_PART: Final = 0.03
+"""Of an image's columns that a strip at its edge takes."""
+LEVEL: Final = 0.004
+"""Difference of neighbouring strips in the open beam."""
+BLOCKS: Final = 4
+"""Parts of a strip that are compared with each other."""
+SEEN: Final = 0.8
+"""Share of the views that must see the open beam on both sides."""
+
+
+def flat_findings(flats: npt.NDArray[Any], dark: npt.NDArray[Any]) -> Iterator[Finding]:
+    """Find flat images of different beams.
+
+    Args:
+        flats: (k, rows, cols) [counts].
+        dark: (rows, cols) [counts].
+    """
+    if len(flats) < 2:
+        return
+    signal = np.asarray(flats, dtype=np.float32) - dark
+    mean = signal.mean(axis=0)
+    alive = mean > 1.0
+    if not alive.any():
+        return
+    ratio = signal[:, alive] / mean[alive]
+    level = np.median(ratio, axis=1)
+    spread = np.median(np.abs(ratio - level[:, None]), axis=1)
+    noise = float((1.4826 * 1.2533 * spread).max() / np.sqrt(ratio.shape[1]))
+    apart = float(np.ptp(level))
+    if apart > max(MOST_APART, SIGMAS * noise):
+        cause = (
+            f"the flat images differ by {100 * apart:.3g} %: level {level.min():.3g} to "
+            f"{level.max():.3g} of their mean"
+        )
+        remedy = "was the current changed between them? use those that belong to the scan"
+        yield Finding("flats disagree", cause, remedy, Severity.WARNING, apart)
+
+
+def beam_findings(levels_seen: Sequence[float | None]) -> Iterator[Finding]:
+    """Find an open beam beside the object that is not that of the flat image.
+
+    Args:
+        levels_seen: of the open beam in some views (`open_beam`), relative to the flat image.
+    """
+    found = [level for level in levels_seen if level is not None]
+    if len(found) < max(2.0, SEEN * len(levels_seen)):
+        return
+    levels = np.array(found)
+    worst = float(levels[np.abs(levels - 1.0).argmax()])
+    if abs(worst - 1.0) > MOST_DRIFT:
+        span = " to ".join(dict.fromkeys(f"{level:.3g}" for level in (levels.min(), levels.max())))
+        cause = f"the images' edges are {span} times the flat image in all views"
+        remedy = (
+            "another beam than the flat image's, or scatter: a flat image of the scan is needed"
+            if worst > 1.0
+            else "another beam than the flat image's, or an object that reaches beyond both edges"
+        )
+        yield Finding("flats disagree", cause, remedy, Severity.WARNING, worst)
+
+
+def open_beam(
+    counts: npt.NDArray[Any], dark: npt.NDArray[Any], opened: npt.NDArray[Any]
+) -> float | None:
+    """The level of the open beam at an image's left and right edges, relative to the flat image.
+
+    Args:
+        counts: the image (rows, cols).
+        dark: (rows, cols) [counts].
+        opened: flat less dark image (rows, cols) [counts]; NaN where there is no beam.
+
+    Returns:
+        None where the object or its scatter reaches an edge.
+    """
+    rows, cols = counts.shape
+    wide = max(1, int(STRIP_PART * cols))
+    if cols < 8 * wide or rows < 2 * BLOCKS:
+        return None
+    levels = []
+    for some in (slice(2 * wide), slice(-1, -2 * wide - 1, -1)):
+        turned = (counts[:, some] - dark[:, some]) / opened[:, some]
+        outer, inner = _blocks(turned[:, :wide]), _blocks(turned[:, wide : 2 * wide])
+        both = np.concatenate([outer, inner])
+        if not np.isfinite(both).all():
+            return None
+        spread = float(np.nanstd(turned[:, : 2 * wide]))
+        sigma = spread / np.sqrt(rows * wide)
+        if abs(float(outer.mean() - inner.mean())) > max(LEVEL, SIGMAS * sigma):
+            return None
+        if float(np.ptp(both)) > max(2.5 * LEVEL, SIGMAS * sigma * np.sqrt(2 * BLOCKS)):
+            return None
+        levels.append(float(both.mean()))
+    left, right = levels
+    return 0.5 * (left + right) if abs(left - right) <= 2.5 * LEVEL * max(left, right) else None
+
+
+def _blocks(strip: npt.NDArray[Any]) -> FloatArray:
+    """Means of the parts of a strip, from top to bottom."""
+    parts = [part[np.isfinite(part)] for part in np.array_split(strip, BLOCKS)]
+    return np.array([float(part.mean()) if part.size else np.nan for part in parts])
