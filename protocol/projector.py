@@ -147,6 +147,8 @@ class VolumePut(f.Params):
     start: Bytes = 0
     """position of this chunk [bytes]"""
     data: Buffer | None = None
+    evictable: bool = False
+    """may be forgotten, the least recently used first, where memory is needed for others"""
 
     @model_validator(mode="after")
     def _one(self) -> VolumePut:
@@ -259,6 +261,8 @@ class Health(f.Result):
     volumes: int
     memory_used: int
     memory_limit: int
+    memory_evictable: int | None = None
+    """of what is used: what makes room where it is needed"""
 
 
 PROJECTOR_METHODS: Final[Mapping[str, AnyMethod]] = {

@@ -226,6 +226,7 @@ class TwinSettings(FarProjectorSettings, ScannerSettings):
         projector_port: Connect to the projector on this port of 127.0.0.1 instead.
         projector_tls_ca: Speak TLS with the projectors and trust this certificate.
         no_noise: Make images of expected counts, without noise.
+        memory_limit: Hold samples of at most this size; default: a quarter of the memory.
     """
 
     command = "twin"
@@ -235,6 +236,7 @@ class TwinSettings(FarProjectorSettings, ScannerSettings):
     projector_port: int | None = tcp_port(None)
     projector_tls_ca: Path | None = option(None, metavar="FILE")
     no_noise: bool = option(False, public=False)
+    memory_limit: int | None = option(None, public=False, metavar="SIZE", parser=memory_size)
 
     @property
     def places(self) -> tuple[Address, ...]:

@@ -8,6 +8,9 @@ printed form may carry it, and true geometries are handed out, never the paramet
 A projector may serve several twins, whose samples may have equal names and different contents, so
 it knows each as `NAME #digest of the content`. Of a sample that changes, the version before the
 present one stays, for requests under way; older ones are removed.
+
+Samples that have been taken apart stay in memory until others need it, the least recently used go
+first. What is on the stage, in a scan that has not ended, or being projected stays in any case.
 """
 
 from __future__ import annotations
@@ -15,9 +18,11 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import json
+import math
 import tomllib
-from contextlib import suppress
-from dataclasses import dataclass
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal, Protocol
 
@@ -27,7 +32,9 @@ from flexdt.phantoms import Phantom
 from flexdt.phantoms.channels import Channel, attenuating, channels, scatter_object
 from flexdt.phantoms.checked_reading import scene_to_dict
 from flexdt.protocol import Code, RpcError
+from flexdt.protocol.rpc_errors import too_large
 from flexdt.runtime.wire_errors import ProjectorUnavailable
+from flexdt.server.projector.volume_store import memory_of
 from flexdt.server.storage.stored_samples import SampleStore
 from flexdt.twin.errors import MachineFileError, TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec, check_cone_vec
@@ -45,6 +52,11 @@ LARGEST = 1e6
 """Above any value of a truth file [mm, deg]; NaN and infinities are not below it."""
 VERSIONS: Final = 2
 """Of a sample that the projector keeps."""
+MOST: Final = 64
+"""Samples that stay in memory, however small they are."""
+Pieces = Literal["part", "material"]
+"""How a sample is taken apart: by what attenuates, or by material."""
+_Key = tuple[str, Pieces]
 
 
 class TrueGeometry:
@@ -122,6 +134,30 @@ class Projector(Protocol):
         """Line integrals, float32 (n, rows, cols)."""
 
 
+@dataclass(eq=False)
+class _Apart:
+    """A sample that has been taken apart.
+
+    Attributes:
+        phantom: it.
+        found: its pieces, (body, factor) each, or channels.
+        bodies: of these.
+        names: the projector's for them; empty while it has not been sent.
+        users: requests that it is being projected for.
+    """
+
+    phantom: Phantom
+    found: Any
+    bodies: list[Body]
+    names: list[str] = field(default_factory=list)
+    users: int = 0
+
+    @property
+    def nbytes(self) -> int:
+        """In this process."""
+        return sum(bytes_of(body) for body in self.bodies)
+
+
 @dataclass(eq=False, repr=False)
 class Imaging:
     """Line integrals of the sample on the stage.
@@ -131,15 +167,22 @@ class Imaging:
         truth: hidden misalignment.
         samples: what may stand on the stage.
         sensor: the detector.
+        memory_limit: bytes of the samples that stay in memory; None for any.
+        pinned: samples that stay in any case.
+        room: bytes that a projector can have for a sample; None if not known.
     """
 
     projector: Projector
     truth: TrueGeometry
     samples: SampleStore
     sensor: PixelGrid
+    memory_limit: int | None = None
+    pinned: Callable[[], Collection[Sample]] = lambda: ()
+    room: Callable[[], Awaitable[int | None]] | None = None
 
     def __post_init__(self) -> None:
-        self._known: dict[tuple[str, str], tuple[Phantom, Any, list[str]]] = {}
+        self._known: dict[_Key, _Apart] = {}
+        """The least recently used first."""
         self._versions: dict[str, list[str]] = {}
         self._scatterer: tuple[Phantom, Object] | None = None
         self._sending = asyncio.Lock()
@@ -167,16 +210,16 @@ class Imaging:
         """
         if not sample.name:
             return np.zeros((len(poses), *camera.shape), dtype=np.float32)
-        _, bodies, names = await self._sent(sample, "part")
-        factors = [factor for _, factor in bodies]
         cone = (truth or self.truth).cone_vec(poses, sample.offset)
         check_cone_vec(cone, camera.pixels_mm(self.sensor))
-        if factors == [1.0]:
-            return await self.projector.project(names[0], cone, camera.shape)
-        total = np.zeros((len(cone), *camera.shape), dtype=np.float32)
-        for name, factor in zip(names, factors, strict=True):
-            total += np.float32(factor) * await self.projector.project(name, cone, camera.shape)
-        return total
+        async with self._sent(sample, "part") as apart:
+            factors = [factor for _, factor in apart.found]
+            if factors == [1.0]:
+                return await self.projector.project(apart.names[0], cone, camera.shape)
+            total = np.zeros((len(cone), *camera.shape), dtype=np.float32)
+            for name, factor in zip(apart.names, factors, strict=True):
+                total += np.float32(factor) * await self.projector.project(name, cone, camera.shape)
+            return total
 
     async def path_lengths(
         self,
@@ -203,66 +246,135 @@ class Imaging:
         check_cone_vec(cone, camera.pixels_mm(self.sensor))
         if spot[1] > 1:
             cone = ConeVec(spot_views(cone.rows, *spot))
-        channels: tuple[Channel, ...] = ()
-        names: list[str] = []
-        if sample.name:
-            _, channels, names = await self._sent(sample, "material")
-        out = np.empty((len(channels), len(cone), *camera.shape), dtype=np.float32)
-        for i, name in enumerate(names):
-            out[i] = await self.projector.project(name, cone, camera.shape)
-        return channels, out, cone.rows
+        if not sample.name:
+            return (), np.empty((0, len(cone), *camera.shape), dtype=np.float32), cone.rows
+        async with self._sent(sample, "material") as apart:
+            out = np.empty((len(apart.names), len(cone), *camera.shape), dtype=np.float32)
+            for i, name in enumerate(apart.names):
+                out[i] = await self.projector.project(name, cone, camera.shape)
+            return apart.found, out, cone.rows
 
     async def ray(self, sample: Sample, cone: ConeVec) -> dict[str, float]:
         """Material -> path [mm] to the one pixel of `cone`, n = 1, in the object's frame."""
         if not sample.name:
             return {}
-        _, channels, names = await self._sent(sample, "material")
         view = sample.offset.to_sample(cone)
-        return {
-            channel.material.name: float((await self.projector.project(name, view, (1, 1))).sum())
-            for channel, name in zip(channels, names, strict=True)
-        }
+        async with self._sent(sample, "material") as apart:
+            return {
+                channel.material.name: float(
+                    (await self.projector.project(name, view, (1, 1))).sum()
+                )
+                for channel, name in zip(apart.found, apart.names, strict=True)
+            }
 
     async def scatterer(self, sample: Sample, voxels: int) -> Object:
         """The materials of `sample` on a grid of about so many voxels, made once."""
-        phantom, channels, _ = await self._sent(sample, "material")
-        if self._scatterer is None or self._scatterer[0] is not phantom:
-            size = phantom.size_mm
-            thing = await asyncio.to_thread(scatter_object, channels, size, voxels)
-            self._scatterer = phantom, thing
-            return thing
-        return self._scatterer[1]
+        async with self._sent(sample, "material") as apart:
+            phantom = apart.phantom
+            if self._scatterer is None or self._scatterer[0] is not phantom:
+                size = phantom.size_mm
+                thing = await asyncio.to_thread(scatter_object, apart.found, size, voxels)
+                self._scatterer = phantom, thing
+                return thing
+            return self._scatterer[1]
 
-    async def _sent(
-        self, sample: Sample, pieces: Literal["part", "material"]
-    ) -> tuple[Phantom, Any, list[str]]:
-        """The sample, taken apart and sent to the projector where it is new or has changed.
+    async def require_room(self, sample: Sample, pieces: Pieces) -> None:
+        """Check that a scan's sample can be held: here, beside what stays in any case, and there.
+
+        Args:
+            sample: that the scan is to show.
+            pieces: how the scan takes it apart.
+
+        Raises:
+            RpcError: -32008, says what it takes and what there is.
+        """
+        if not sample.name:
+            return
+        async with self._sending:
+            apart = await self._taken_apart(sample, pieces)
+        mine = (_name(sample), pieces)
+        if self.memory_limit is not None:
+            others = sum(self._known[key].nbytes for key in self._pinned_keys() if key != mine)
+            left = self.memory_limit - others
+            if apart.nbytes > left:
+                raise self._too_large(sample, apart.nbytes, left, self.memory_limit, "the twin")
+        there = None if self.room is None else await self.room()
+        need = sum(memory_of(body) for body in apart.bodies)
+        if there is not None and need > there:
+            raise self._too_large(sample, need, there, there, "the projector")
+
+    def _too_large(self, sample: Sample, need: int, left: int, limit: int, who: str) -> RpcError:
+        error = too_large(f"the sample {sample.name!r} in the memory of {who}", need, max(0, left))
+        assert isinstance(error.data, dict)
+        error.data.update(sample=sample.name, memory_limit=limit, option="--memory-limit")
+        return error
+
+    @asynccontextmanager
+    async def _sent(self, sample: Sample, pieces: Pieces) -> AsyncIterator[_Apart]:
+        """The sample, taken apart, and sent to the projector where it is new or has changed.
 
         Args:
             sample: on the stage.
             pieces: "part" for what attenuates, (body, factor) each; "material" for channels.
-
-        Returns:
-            Its phantom, its pieces, and the projector's names for them.
         """
-        name = _name(sample)
         async with self._sending:
-            phantom = await asyncio.to_thread(self.samples.load, sample.name, sample.material)
-            known = self._known.get((name, pieces))
-            if known is None or known[0] is not phantom:
-                if pieces == "part":
-                    found: Any = await asyncio.to_thread(attenuating, phantom)
-                    bodies = [body for body, _ in found]
-                else:
-                    found = await asyncio.to_thread(channels, phantom)
-                    bodies = [channel.body for channel in found]
-                whole = pieces == "part" and len(bodies) == 1
-                names = [
-                    await self._put(name if whole else f"{name}, {pieces} {i}", body)
-                    for i, body in enumerate(bodies)
-                ]
-                known = self._known[name, pieces] = phantom, found, names
-        return known
+            apart = await self._taken_apart(sample, pieces)
+            apart.users += 1
+            try:
+                if not apart.names:
+                    await self._send(apart, _name(sample), pieces)
+                await self._forget_old()
+            except BaseException:
+                apart.users -= 1
+                raise
+        try:
+            yield apart
+        finally:
+            apart.users -= 1
+
+    async def _taken_apart(self, sample: Sample, pieces: Pieces) -> _Apart:
+        """The sample as it is now, used just now; with `_sending` held."""
+        key = (_name(sample), pieces)
+        phantom = await asyncio.to_thread(self.samples.load, sample.name, sample.material)
+        apart = self._known.pop(key, None)
+        if apart is None or apart.phantom is not phantom:
+            if pieces == "part":
+                found: Any = await asyncio.to_thread(attenuating, phantom)
+                bodies = [body for body, _ in found]
+            else:
+                found = await asyncio.to_thread(channels, phantom)
+                bodies = [channel.body for channel in found]
+            apart = _Apart(phantom, found, bodies)
+        self._known[key] = apart
+        return apart
+
+    async def _send(self, apart: _Apart, name: str, pieces: Pieces) -> None:
+        whole = pieces == "part" and len(apart.bodies) == 1
+        apart.names = [
+            await self._put(name if whole else f"{name}, {pieces} {i}", body)
+            for i, body in enumerate(apart.bodies)
+        ]
+
+    def _pinned_keys(self) -> set[_Key]:
+        names = {_name(sample) for sample in self.pinned()}
+        return {key for key in self._known if key[0] in names}
+
+    async def _forget_old(self) -> None:
+        """Forget the least recently used samples beyond what may stay; with `_sending` held."""
+        stays = self._pinned_keys()
+        most = math.inf if self.memory_limit is None else self.memory_limit
+        used = sum(apart.nbytes for apart in self._known.values())
+        newest = next(reversed(self._known))
+        for key, apart in list(self._known.items()):
+            if used <= most and len(self._known) <= MOST:
+                return
+            if key in stays or key == newest or apart.users:
+                continue
+            used -= apart.nbytes
+            del self._known[key]
+            for name in {named.rpartition(" #")[0] for named in apart.names}:
+                await self._remove(name, 0)
+                del self._versions[name]
 
     async def _put(self, name: str, body: Body) -> str:
         """Make sure that the projector has a version of something; its name there."""
@@ -277,7 +389,7 @@ class Imaging:
                     raise
                 for other in self._versions:
                     await self._remove(other, 1)
-                await self.projector.put(named, body)
+                await self.projector.put(named, body)  # older servers forget nothing by themselves
         versions[:] = [*(v for v in versions if v != named), named]
         return named
 
@@ -288,6 +400,13 @@ class Imaging:
             with suppress(ProjectorUnavailable, RpcError):  # then it may have forgotten more
                 await self.projector.remove(versions[0])
             versions.pop(0)
+
+
+def bytes_of(body: Body) -> int:
+    """Memory that a body takes in this process."""
+    if isinstance(body, Scene | TriangleMesh):
+        return memory_of(body)
+    return body.data.nbytes
 
 
 def digest_of(body: Body) -> str:

@@ -1,7 +1,7 @@
 """The methods of one projector.
 
 It connects when it is asked for something, and sends a volume when it is first asked for it, and
-again to a server that has restarted or lost it.
+again to a server that has restarted or has forgotten it for others.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ _T = TypeVar("_T")
 
 CHUNK: Final = 8 * 2**20
 """Bytes of a volume in one message."""
+TRIES: Final = 5
+"""How often a volume is sent that other clients' volumes displace before it is projected."""
 
 
 @dataclass(eq=False, repr=False)
@@ -49,6 +51,8 @@ class ProjectorClient:
     def __post_init__(self) -> None:
         self._sent: dict[str, Body] = {}
         self._instance: object = None
+        self._evicts = False
+        """Whether the server forgets volumes where memory is needed."""
         self._channel: ProjectorLink | None = None
         self._connecting, self._sending = asyncio.Lock(), asyncio.Lock()
         self._closed = False
@@ -76,7 +80,7 @@ class ProjectorClient:
 
     async def _give(self, channel: ProjectorLink, name: str, body: Body) -> None:
         if self._sent.get(name) is not body:
-            await _send(channel, name, body)
+            await _send(channel, name, body, {"evictable": True} if self._evicts else {})
             self._sent[name] = body
 
     async def remove(self, name: str) -> None:
@@ -105,17 +109,17 @@ class ProjectorClient:
             "volume": name, "cone_vec": image.encode(cone_vec.rows), "detector": list(shape),
         }  # fmt: skip
         whole = (len(cone_vec), *shape)
-        if body is not None:
-            await self.give(name, body)
-        try:
-            return await self._ask("project", lambda c: c.ask_array("project", params, whole))
-        except RpcError as error:
-            there = error.data.get("allowed") if isinstance(error.data, Mapping) else None
-            if body is None or not isinstance(there, list) or name in there:
-                raise
-        self._sent.pop(name, None)  # another client has removed it
-        await self.give(name, body)
-        return await self._ask("project", lambda c: c.ask_array("project", params, whole))
+        for left in reversed(range(TRIES)):
+            if body is not None:
+                await self.give(name, body)
+            try:
+                return await self._ask("project", lambda c: c.ask_array("project", params, whole))
+            except RpcError as error:
+                there = error.data.get("allowed") if isinstance(error.data, Mapping) else None
+                if body is None or not isinstance(there, list) or name in there or not left:
+                    raise
+            self._sent.pop(name, None)  # it was forgotten for another, or removed by another client
+        raise AssertionError("the last try returns or raises")
 
     async def health(self) -> Health:
         """The server's version, load and memory."""
@@ -151,15 +155,16 @@ class ProjectorClient:
             why = getattr(error, "strerror", None) or str(error) or "no answer"
             raise ProjectorUnavailable(f"no projector at {self.host}:{self.port} ({why})") from None
         instance = answer.get("instance") if isinstance(answer, Mapping) else None
+        self._evicts = isinstance(answer, Mapping) and answer.get("evicts") is True
         if instance != self._instance:
             self._instance, self._sent = instance, {}
         return channel
 
 
-async def _send(channel: ProjectorLink, name: str, value: Body) -> None:
-    """Send a volume or mesh in chunks, or a scene."""
+async def _send(channel: ProjectorLink, name: str, value: Body, how: Mapping[str, object]) -> None:
+    """Send a volume or mesh in chunks, or a scene; `how` are further parameters."""
     if isinstance(value, Scene):
-        await channel.ask("volume.put", {"name": name, "scene": scene_to_dict(value)})
+        await channel.ask("volume.put", {"name": name, "scene": scene_to_dict(value), **how})
         return
     what: dict[str, object]
     if isinstance(value, TriangleMesh):
@@ -173,4 +178,5 @@ async def _send(channel: ProjectorLink, name: str, value: Body) -> None:
         flat = np.ascontiguousarray(value.data, dtype="<f4").reshape(-1).view(np.uint8)
     for start in range(0, flat.size, CHUNK):
         data = flat[start : start + CHUNK].data.toreadonly()
-        await channel.ask("volume.put", {"name": name, **what, "start": start, "data": data})
+        params = {"name": name, **what, **how, "start": start, "data": data}
+        await channel.ask("volume.put", params)

@@ -90,6 +90,11 @@ class ProjectorPool:
         for member in self._members:
             await member.client.close()
 
+    async def room(self) -> int | None:
+        """Bytes that the projector with most memory can have for one sample; None if not known."""
+        found = await asyncio.gather(*map(_room_of, self._members))
+        return max((room for room in found if room is not None), default=None)
+
     async def put(self, name: str, body: Body) -> None:
         """Have one projector take it, which shows that it can be taken; errors as the client's."""
         self._values[name] = body
@@ -222,3 +227,14 @@ class ProjectorPool:
         if len(kinds) > 1:
             kept = "; ".join(" ".join(kind) for kind in kinds)
             log("projectors differ: so may the last digits of frames", logging.WARNING, kinds=kept)
+
+
+async def _room_of(member: _Member) -> int | None:
+    """What a projector can have for a sample, by its health; None where it does not say."""
+    try:
+        health = await asyncio.wait_for(member.client.health(), LATE_S)
+    except (ProjectorUnavailable, RpcError, TimeoutError):
+        return None  # who is silent is asked when the scan runs
+    if health.memory_evictable is None:
+        return None
+    return health.memory_limit - health.memory_used + health.memory_evictable

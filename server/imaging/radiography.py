@@ -28,7 +28,7 @@ from flexdt.protocol.connection import encoded
 from flexdt.protocol.methods.image_messages import PREDICTION_LIMITS, ExposurePrediction
 from flexdt.protocol.state_model import ImageEdge, ImageFlags
 from flexdt.runtime.workers import Workers
-from flexdt.server.imaging.projections import Imaging, TrueGeometry
+from flexdt.server.imaging.projections import Imaging, Pieces, TrueGeometry
 from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.poses import Poses
@@ -140,6 +140,11 @@ class Radiography:
         if self.scatter != "off":
             figures |= {f"scatter_{self.scatter}": 1.0, "scatter_error": SCATTER.error}
         return figures | self.tube.figures()
+
+    async def require_room(self, sample: Sample) -> None:
+        """Check that a scan's sample can be held, as `Imaging.require_room`."""
+        pieces: Pieces = "part" if self.physics == "ideal" else "material"
+        await self.imaging.require_room(sample, pieces)
 
     async def take(
         self,

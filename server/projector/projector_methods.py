@@ -44,14 +44,14 @@ async def hello(context: Context, client: JobClient, id: Id, p: Hello) -> object
     client.link.deadlines.stop("hello")
     return {
         "protocol": PROTOCOL, "server": f"flexdt projector {version('flexdt')}",
-        "machine": "", "instance": context.instance,
+        "machine": "", "instance": context.instance, "evicts": True,
     }  # fmt: skip
 
 
 async def volume_put(context: Context, client: JobClient, id: Id, p: wire.VolumePut) -> object:
     """Store a scene, or a chunk of voxels or of a mesh."""
     if p.scene is not None:
-        context.store.put(p.name, scene_from_dict(p.scene))
+        context.store.put(p.name, scene_from_dict(p.scene), evictable=p.evictable)
         return {"name": p.name, "received": 0, "total": 0, "complete": True}
     what = p.grid or p.mesh
     assert what is not None
@@ -62,7 +62,7 @@ async def volume_put(context: Context, client: JobClient, id: Id, p: wire.Volume
         ready = made
         volume = await context.run(client, id, lambda: _prepared(ready()))
         assert isinstance(volume, Volume | TriangleMesh)
-        context.store.put(p.name, volume)
+        context.store.put(p.name, volume, evictable=p.evictable)
     return {"name": p.name, "received": received, "total": what.nbytes, "complete": complete}
 
 
@@ -145,6 +145,7 @@ async def health(context: Context, client: JobClient, id: Id, p: Params) -> obje
         "volumes": len(context.store),
         "memory_used": context.store.used,
         "memory_limit": context.store.limit,
+        "memory_evictable": context.store.evictable,
     }
 
 

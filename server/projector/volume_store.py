@@ -1,7 +1,8 @@
 """Volumes, meshes and scenes of the projector by name.
 
 Memory is counted as what a volume takes once it is projected: its voxels and the projector's own
-z-contiguous copy. Nothing is evicted: above the limit a put is an error.
+z-contiguous copy. Where it is needed, volumes that were put as evictable are forgotten, the least
+recently used first; the others stay until they are removed. What does not fit then is an error.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from flexdt.twin.projection import Body, TriangleMesh, Volume
 LAYOUT_COPIES = 2
 """A volume's voxels are kept twice: as they came and z-contiguous."""
 
+NAMED = 50
+"""Volumes that an error lists, those used last."""
 SOLID_BYTES = 1024
 """Counted for each solid of a scene."""
 
@@ -58,6 +61,9 @@ class VolumeStore:
     def __init__(self, limit: int) -> None:
         self.limit = limit
         self._held: dict[str, Body] = {}
+        """The least recently used first."""
+        self._evictable: set[str] = set()
+        self._bytes = self._evictable_bytes = 0
         self._uploads: dict[tuple[object, str], _Upload] = {}
 
     def __len__(self) -> int:
@@ -69,8 +75,12 @@ class VolumeStore:
     @property
     def used(self) -> int:
         """Bytes taken by volumes and uploads."""
-        held = sum(memory_of(v) for v in self._held.values())
-        return held + sum(_needed(u.what) for u in self._uploads.values())
+        return self._bytes + sum(_needed(u.what) for u in self._uploads.values())
+
+    @property
+    def evictable(self) -> int:
+        """Bytes of these that make room where it is needed."""
+        return self._evictable_bytes
 
     def get(self, name: str) -> Body:
         """The volume called `name`.
@@ -79,21 +89,34 @@ class VolumeStore:
             RpcError: -32602, listing the names.
         """
         if name not in self._held:
+            last = list(self._held)[-NAMED:]
+            older = len(self._held) - len(last)
+            more = f" and {older} others" if older else ""
             raise invalid_params(
-                f"no volume {name!r}; there are: {', '.join(sorted(self._held)) or 'none'}",
+                f"no volume {name!r}; there are: {', '.join(sorted(last)) or 'none'}{more}",
                 [problem("volume", "unknown volume", name)],
-                sorted(self._held),
+                sorted(last),
             )
-        return self._held[name]
+        value = self._held[name] = self._held.pop(name)
+        return value
 
-    def put(self, name: str, value: Body) -> None:
+    def put(self, name: str, value: Body, *, evictable: bool = False) -> None:
         """Store a whole volume, mesh or scene under `name`, in place of its namesake.
+
+        Args:
+            name, value: what.
+            evictable: whether it may be forgotten where memory is needed.
 
         Raises:
             RpcError: -32008, above the memory limit.
         """
         self.reserve(f"volume {name!r}", memory_of(value), name)
+        self.remove(name)
         self._held[name] = value
+        self._bytes += memory_of(value)
+        if evictable:
+            self._evictable.add(name)
+            self._evictable_bytes += memory_of(value)
 
     def chunk(
         self,
@@ -136,7 +159,14 @@ class VolumeStore:
 
     def remove(self, name: str) -> bool:
         """Forget a volume; returns whether there was one."""
-        return self._held.pop(name, None) is not None
+        value = self._held.pop(name, None)
+        if value is None:
+            return False
+        self._bytes -= memory_of(value)
+        if name in self._evictable:
+            self._evictable.discard(name)
+            self._evictable_bytes -= memory_of(value)
+        return True
 
     def forget(self, owner: object) -> None:
         """Drop the unfinished uploads of a client that has gone."""
@@ -148,14 +178,21 @@ class VolumeStore:
         return [_info(name, self._held[name]) for name in sorted(self._held)]
 
     def reserve(self, what: str, needed: int, replaced: str | None = None) -> None:
-        """Raise -32008 unless there is room for `needed` bytes more, in place of a volume's."""
+        """Make room for `needed` bytes more, in place of a volume's; -32008 where there is none."""
         old = self._held.get(replaced) if replaced is not None else None
         used = self.used - (0 if old is None else memory_of(old))
-        if used + needed > self.limit:
-            error = too_large(what, needed, max(0, self.limit - used))
+        kept = memory_of(old) if old is not None and replaced in self._evictable else 0
+        if used - (self._evictable_bytes - kept) + needed > self.limit:
+            free = self.limit - used + self._evictable_bytes - kept
+            error = too_large(what, needed, max(0, free))
             assert isinstance(error.data, dict)
             error.data.update(memory_used=used, memory_limit=self.limit)
             raise error
+        names = iter([n for n in self._held if n in self._evictable and n != replaced])
+        while used + needed > self.limit:
+            name = next(names)
+            used -= memory_of(self._held[name])
+            self.remove(name)
 
 
 def memory_of(value: Body) -> int:

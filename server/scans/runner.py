@@ -13,6 +13,7 @@ from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from flexdt.protocol.rpc_errors import Code, RpcError
 from flexdt.server.scans.frame_pipeline import FramePipeline
 from flexdt.server.scans.rejoin_plan import rejoin
 from flexdt.server.scans.twin_clock import TwinClock
@@ -69,6 +70,8 @@ def _allowed(scanner: ScannerTwin, axis: str, value: float, limit: str) -> float
 
 def hopeless(error: Exception) -> bool:
     """Whether the same work would meet it again, whoever tries: a limit of what is computed."""
+    if isinstance(error, RpcError):  # a sample that no projector can hold
+        return error.code == Code.TOO_LARGE
     return isinstance(error, (LimitError, GeometryError)) or type(error) is TwinError
 
 

@@ -199,6 +199,7 @@ class Submissions:
         checked = await self.checks.sound(await self._matter(asked.wish, begin.start, begin.sample))
         self._ensure_same(begin)
         await asyncio.to_thread(self._require_room, checked.plan.bytes, name)
+        await self.radiography.require_room(begin.sample)
         warnings = list(checked.warnings)
         if resume:
             there = sum(n.endswith(".tif") for n in self.root.folder(name).names())

@@ -73,6 +73,7 @@ class SampleStore:
         limit: largest upload [bytes].
         most: uploads there may be.
         room: on the disk; None for any.
+        memory_limit: of what is parsed and kept [bytes]; None for any.
     """
 
     def __init__(
@@ -81,7 +82,9 @@ class SampleStore:
         limit: int = MAX_UPLOAD_BYTES,
         most: int = 10_000,
         room: DiskRoom | None = None,
+        memory_limit: int | None = None,
     ) -> None:
+        self._memory_limit = math.inf if memory_limit is None else memory_limit
         self._folder, self._limit, self._most = folder, limit, most
         self._incoming: Incoming = Incoming(folder, 2 * limit, room)
         self._heads: dict[str, UploadHead] = {}
@@ -152,8 +155,11 @@ class SampleStore:
         self._loaded[key] = phantom
         if revision is not None:
             self._revisions[key[0]] = revision
-        while len(self._loaded) > KEPT:
-            del self._loaded[next(k for k in self._loaded if k != self.standing())]
+        for old in [k for k in self._loaded if k not in (self.standing(), key)]:
+            used = sum(map(_bytes_of, self._loaded.values()))
+            if len(self._loaded) <= KEPT and used <= self._memory_limit:
+                break
+            del self._loaded[old]
 
     def receive(self, head: UploadHead, start: int, data: bytes) -> int:
         """Take a chunk, see `Incoming.receive`; returns the bytes received so far.
@@ -300,6 +306,12 @@ class SampleStore:
                             own.set_aside(self._folder, damaged, error, without)
             raise PhantomError(f"the upload {head.name!r} cannot be read: {error}") from None
         return raw
+
+
+def _bytes_of(phantom: Phantom) -> int:
+    """Memory that the arrays of a phantom take."""
+    voxels = 0 if phantom.voxels is None else phantom.voxels.data.nbytes
+    return voxels + sum(s.vertices.nbytes + s.faces.nbytes for s in phantom.surfaces)
 
 
 def _revision(head: UploadHead, raw: bytes) -> str:

@@ -13,7 +13,7 @@ import math
 import secrets
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Coroutine
+from collections.abc import Awaitable, Callable, Collection, Coroutine
 from dataclasses import asdict, replace
 from datetime import UTC, datetime, timedelta
 from importlib.metadata import version
@@ -146,6 +146,8 @@ class TwinServer:
         physics, scatter: how images are made, see `radiography`.
         projectors: servers behind `projector`.
         wall: real time [s], monotonic; a simulation has its own.
+        memory_limit: of the samples in memory [bytes]; None for any.
+        projector_room: bytes that a projector can have for a sample; None if not known.
     """
 
     def __init__(
@@ -163,6 +165,8 @@ class TwinServer:
         scatter: Scatter = "off",
         projectors: int = 1,
         wall: Callable[[], float] = time.monotonic,
+        memory_limit: int | None = None,
+        projector_room: Callable[[], Awaitable[int | None]] | None = None,
     ) -> None:
         self.limits = TwinLimits() if limits is None else limits
         self.version = version("flexdt")
@@ -180,8 +184,9 @@ class TwinServer:
         settle(root, RESERVED)
         room = DiskRoom(root, self.limits.disk_quota)
         self.samples = SampleStore(
-            root.folder("samples"), self.limits.max_upload, self.limits.max_samples, room
-        )
+            root.folder("samples"), self.limits.max_upload, self.limits.max_samples, room,
+            memory_limit,
+        )  # fmt: skip
         self.samples.standing = lambda: (self.scanner.sample.name, self.scanner.sample.material)
         self.shapes = Shapes()
         self.past_scans = PastScans(self.root, machine, profile)
@@ -197,8 +202,9 @@ class TwinServer:
         self.stage = Stage(machine, profile, self.samples)
         self.detours = ObstacleMoves(self.scanner, self.clock, self.stage, self.changed)
         self.imaging = Imaging(
-            projector, truth or TrueGeometry(), self.samples, machine.detector.pixels
-        )
+            projector, truth or TrueGeometry(), self.samples, machine.detector.pixels,
+            memory_limit, self._in_use, projector_room,
+        )  # fmt: skip
         self.jobs = Jobs(
             self.scanner, self.clock, self._job_changed, max_waiting=self.limits.max_jobs,
             projectors=projectors, root=self.root, max_ended=self.limits.max_ended_jobs,
@@ -412,6 +418,10 @@ class TwinServer:
         for end in self._awaited:  # a stop brings the end forward: look again
             if not end.done():
                 end.set_result(None)
+
+    def _in_use(self) -> list[Sample]:
+        """What is on the stage, or in a scan that has not ended."""
+        return [self.scanner.sample, *self.jobs.samples()]
 
     def _settled(self) -> None:
         """Motion has ended."""

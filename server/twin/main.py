@@ -26,7 +26,7 @@ PATIENCE_S = 10.0
 
 async def run(options: TwinSettings) -> int:
     """Serve until SIGTERM or SIGINT; returns the exit code."""
-    from flexdt.runtime.files.directory import open_data
+    from flexdt.runtime.files.directory import memory_bytes, open_data
     from flexdt.runtime.files.own_documents import lock_folder
 
     machine = machines.machine(options.machine)
@@ -67,6 +67,8 @@ async def run(options: TwinSettings) -> int:
         physics=options.physics,
         scatter=options.scatter,
         projectors=len(clients),
+        memory_limit=options.memory_limit or memory_bytes() // 4,
+        projector_room=projector.room,
         limits=access.with_limits(
             options.limit, access.TwinLimits(), access.limit_names(access.ConnectionLimits())
         ),

@@ -3,56 +3,25 @@
 from __future__ import annotations
 
 import asyncio
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from flexdt.phantoms import Phantom, load_phantom, voxel_phantom
+from flexdt.phantoms import load_phantom
 from flexdt.runtime.files.directory import open_data
 from flexdt.server.imaging.projections import Imaging, TrueGeometry, digest_of
 from flexdt.server.imaging.projector_client import ProjectorClient
 from flexdt.server.imaging.projector_pool import ProjectorPool
 from flexdt.server.projector.service import ProjectorServer, serve_projector
 from flexdt.server.storage.stored_samples import SampleStore
-from flexdt.twin.machine.camera import Roi
-from flexdt.twin.machine.description import builtin_machine, profile_of
 from flexdt.twin.projection import Volume
-from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.scanner.state import Sample
 from tests.support.projector_user import ProjectorUser
+from tests.support.shelf import CAMERA, POSES, M, Shelf, block, brightest, imaging_of
 
-M = builtin_machine()
-SCANNER = ScannerTwin(M, profile_of(M))
-CAMERA = replace(SCANNER.camera, roi=Roi(900, 700, 1027, 795))
-POSES = SCANNER.poses_at(SCANNER.positions(0.0), CAMERA)
 LIMIT = 256 * 2**20
-
-
-def block(value: float, size: int = 8) -> Phantom:
-    """A cube of one attenuation [1/mm], wider than the image."""
-    return voxel_phantom(np.full((size,) * 3, value, np.float32), 24.0 / size, name="thing")
-
-
-class Shelf:
-    """Samples whose contents a test changes."""
-
-    def __init__(self, **contents: Phantom) -> None:
-        self.contents = contents
-
-    def load(self, name: str, material: str | None = None) -> Phantom:
-        return self.contents[name]
-
-
-def imaging_of(projector: Any, shelf: Shelf) -> Imaging:
-    return Imaging(projector, TrueGeometry(), shelf, M.detector.pixels)  # type: ignore[arg-type]
-
-
-async def brightest(imaging: Imaging, name: str = "thing") -> float:
-    images = await imaging.line_integrals(Sample(name), POSES, CAMERA)
-    return float(images.max())
 
 
 def run(work: Any, limit: int = LIMIT) -> None:
