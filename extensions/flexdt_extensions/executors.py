@@ -2,8 +2,9 @@
 
 Functions and their arguments must be picklable, because they travel to another process.
 
-A cluster's workers come from a SLURM queue, through dask-jobqueue: each job takes its share of a
-node, and each worker has one thread.
+A cluster's workers come from a SLURM queue (`slurm_jobs`), by the script that dask-jobqueue writes:
+each job takes its share of a node, and each worker has one thread. While a cluster has no workers,
+`cluster_watch` says what is waited for.
 
 Items travel to the workers and their arrays travel back, so nodes need flexdt installed but no
 shared folder.
@@ -31,6 +32,8 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from flexdt.extending import CommandError, message_of, package
 from flexdt.twin.errors import TwinError
+from flexdt_extensions.cluster_watch import ClusterWatch
+from flexdt_extensions.slurm_jobs import REFUSED, SlurmJobs, Tend, lifetime_s
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -63,8 +66,6 @@ SINGLE: Final[Mapping[str, str]] = {f"{name}_THREADS": "1" for name in _NUMBERED
 
 SCHEDULER_S = 10.0
 """How long to try to reach a dask scheduler."""
-REFUSED: Final = 4
-"""Exit code where there is no connection."""
 
 
 def executor(jobs: int | None, scheduler: str | None) -> AbstractContextManager[Executor | None]:
@@ -115,11 +116,13 @@ def _end_with_parent() -> None:
 
 
 @contextmanager
-def dask_executor(address: Any) -> Iterator[Executor]:
+def dask_executor(address: Any, tend: Tend | None = None) -> Iterator[Executor]:
     """The workers of a dask scheduler.
 
     Args:
         address: of a scheduler, or a cluster object of dask.
+        tend: what there is to do and to say about the workers while the work goes on; None says
+            that there are none.
 
     Raises:
         TwinError: dask.distributed is not installed, or what is given is no address.
@@ -138,20 +141,37 @@ def dask_executor(address: Any) -> Iterator[Executor]:
             f"{str(address)!r} is no address of a dask scheduler, e.g. 10.0.0.1:8786: {error}",
             {"asked": str(address)},
         ) from None
+    watch = ClusterWatch(client, tend or (lambda workers: [] if workers else [_none_at(address)]))
     try:
-        with client, client.get_executor() as pool:
+        with client, watch, client.get_executor() as pool:
             yield pool
-    except CancelledError:
-        raise CommandError(
+    except Exception as error:
+        if watch.error is not None:  # it has closed the client, which ends the work in its own ways
+            raise watch.error from None
+        told = _told(error, address, distributed.KilledWorker)
+        if told is None:
+            raise
+        raise told from None
+
+
+def _told(error: Exception, address: Any, killed: type[Exception]) -> CommandError | None:
+    """What an error of dask's means for people; None: it is none of dask's."""
+    if isinstance(error, CancelledError):
+        return CommandError(
             f"the dask scheduler at {address} is lost; once there is one, run the command again to "
             "go on",
             REFUSED,
-        ) from None
-    except distributed.KilledWorker as error:
-        raise CommandError(
+        )
+    if isinstance(error, killed):
+        return CommandError(
             f"workers died of the same task again and again (too little memory?): {error}; run the "
             "command again to go on"
-        ) from None
+        )
+    return None
+
+
+def _none_at(address: Any) -> str:
+    return f"waits for workers of the dask scheduler at {address}: it has none"
 
 
 @dataclass(frozen=True)
@@ -208,6 +228,7 @@ def slurm_executor(wanted: Slurm) -> Iterator[Executor]:
 
     Raises:
         TwinError: dask-jobqueue is not installed, or `sbatch` is not here.
+        CommandError: sbatch refuses the jobs, or they end before their workers come.
     """
     import shutil
 
@@ -218,9 +239,13 @@ def slurm_executor(wanted: Slurm) -> Iterator[Executor]:
             {"asked": "slurm"},
         )
     with _cluster(wanted) as cluster:
-        cluster.scale(jobs=wanted.jobs)
-        with dask_executor(cluster) as pool:
-            yield pool
+        jobs = SlurmJobs(str(cluster.job_script()), wanted.jobs)
+        try:
+            jobs.submit()
+            with dask_executor(cluster, jobs.tend) as pool:
+                yield pool
+        finally:
+            jobs.close()
 
 
 def slurm_workers(path: Path) -> AbstractContextManager[Executor]:
@@ -228,8 +253,27 @@ def slurm_workers(path: Path) -> AbstractContextManager[Executor]:
     return slurm_executor(read_slurm(path))
 
 
+@contextmanager
+def _same_signals() -> Iterator[None]:
+    """Leave this process's signal handlers as they were.
+
+    dask-jobqueue sets one when it is imported, with which Ctrl-C ends a program as if all were
+    done.
+    """
+    before = {number: signal.getsignal(number) for number in signal.valid_signals()}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            if handler is not None and signal.getsignal(number) is not handler:
+                signal.signal(number, handler)
+
+
 def _cluster(wanted: Slurm) -> Any:
-    return package("dask_jobqueue", "SLURM", "slurm", "flexdt-extensions").SLURMCluster(
+    with _same_signals():
+        jobqueue = package("dask_jobqueue", "SLURM", "slurm", "flexdt-extensions")
+    lifetime = lifetime_s(wanted.walltime)
+    return jobqueue.SLURMCluster(
         queue=wanted.queue,
         account=wanted.account,
         cores=wanted.cores,
@@ -238,5 +282,6 @@ def _cluster(wanted: Slurm) -> Any:
         walltime=wanted.walltime,
         job_extra_directives=list(wanted.extra),
         job_script_prologue=[*wanted.setup, *(f"export {k}={v}" for k, v in SINGLE.items())],
+        worker_extra_args=[] if lifetime is None else ["--lifetime", f"{lifetime}s"],
         scheduler_options={"dashboard": False},
     )

@@ -33,6 +33,12 @@ def nearest_there(path: Path) -> Path:
     return there
 
 
+def bytes_of(path: Path) -> int:
+    """Size of a file, or of all files in a folder, such as a volume in `.zarr` [bytes]."""
+    files = (f for f in path.rglob("*") if f.is_file()) if path.is_dir() else iter([path])
+    return sum(file.stat().st_size for file in files)
+
+
 def free_bytes(path: Path) -> int:
     """Bytes free where `path` is, or will be."""
     return shutil.disk_usage(nearest_there(path)).free

@@ -21,6 +21,7 @@ from flexdt.clients.cli.options import Answer, Twin, argument, option
 from flexdt.clients.cli.settings_file import chosen
 from flexdt.library.datasets.exchange_formats import FORMATS, exported, imported
 from flexdt.library.failure import CommandError
+from flexdt.runtime.files.whole_files import bytes_of
 from flexdt.twin.algorithms import ALGORITHMS, DEFAULT
 
 if TYPE_CHECKING:
@@ -126,7 +127,7 @@ def reconstruct(
     z, y, x = document["shape"]
     yield (
         f"{out}: {x} x {y} x {z} voxels of {document['voxel_mm']:g} mm from {document['frames']} "
-        f"frames, {size(out.stat().st_size)}, {duration(document['seconds'])}"
+        f"frames, {size(bytes_of(out))}, {duration(document['seconds'])}"
     )
     if document["accuracy"] is not None:
         yield f"  {Accuracy(**document['accuracy'])}"

@@ -1,0 +1,62 @@
+"""A thread that watches a dask cluster while workers are wanted, and says what it waits for."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Collection
+from typing import Any, Final
+
+from flexdt.extending import CommandError, note
+from flexdt_extensions.slurm_jobs import Tend
+
+EVERY_S: Final = 10.0
+"""Between two looks at the workers, and so between lines of one that waits."""
+
+
+class ClusterWatch(threading.Thread):
+    """Looks at a cluster's workers until it is closed.
+
+    Args:
+        client: of dask.
+        tend: what there is to do and to say.
+
+    Attributes:
+        error: that ended the work, which then ends with cancelled futures.
+    """
+
+    def __init__(self, client: Any, tend: Tend) -> None:
+        super().__init__(name="cluster watch", daemon=True)
+        self._client, self._tend = client, tend
+        self._over = threading.Event()
+        self.error: CommandError | None = None
+
+    def __enter__(self) -> ClusterWatch:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self.join()
+
+    def run(self) -> None:
+        """Look every `EVERY_S`."""
+        while not self._over.wait(EVERY_S):
+            try:
+                lines = self._tend(self._workers())
+            except CommandError as error:
+                self.error = error
+                self._client.close()  # ends the waiting with cancelled futures
+                return
+            except OSError:
+                return  # the scheduler is lost, which the waiting learns too
+            for line in lines:
+                note(line)
+
+    def _workers(self) -> Collection[str]:
+        known = self._client.run_on_scheduler(_names)
+        return [str(name) for name in known]
+
+
+def _names(dask_scheduler: Any = None) -> list[str]:
+    """Names of the workers; runs on the scheduler."""
+    return [str(worker.name) for worker in dask_scheduler.workers.values()]

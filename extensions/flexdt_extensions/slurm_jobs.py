@@ -1,0 +1,199 @@
+"""Jobs of a SLURM queue that run dask workers: submitted, watched, submitted again, cancelled.
+
+A job that has left the queue, as one whose walltime is over, is submitted again while its workers
+are wanted. What sbatch, squeue and sacct say is passed on in their own words. Jobs that end again
+and again without one of their workers having come are an error.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import tempfile
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from flexdt.extending import CommandError
+
+REFUSED: Final = 4
+"""Exit code where there are no workers to be had."""
+BARREN: Final = 3
+"""Jobs in a row that end before a worker of theirs has come, after which no more are submitted."""
+ANSWER_S: Final = 60.0
+"""How long one of SLURM's commands may take."""
+SHOWN: Final = 4
+"""Jobs that a line names."""
+PLACEHOLDER: Final = "dummy-name"
+"""The name of the workers in a script that dask-jobqueue writes."""
+
+
+@dataclass
+class Job:
+    """One job.
+
+    Attributes:
+        id: SLURM's.
+        name: of its workers, which have a number behind it where there are several.
+        seen: whether a worker of it has come.
+    """
+
+    id: str
+    name: str
+    seen: bool = False
+
+    def has(self, worker: str) -> bool:
+        """Whether a worker of that name is one of its own."""
+        return worker == self.name or worker.startswith(f"{self.name}-")
+
+
+class SlurmJobs:
+    """The jobs of one run.
+
+    Args:
+        script: that each runs, with `PLACEHOLDER` for the name of its workers.
+        count: of jobs that are to be in the queue.
+    """
+
+    def __init__(self, script: str, count: int) -> None:
+        self._script, self._count = script, count
+        self.jobs: list[Job] = []
+        self._made = self._barren = 0
+
+    def submit(self) -> None:
+        """Submit what is missing.
+
+        Raises:
+            CommandError: sbatch refuses, in its own words.
+        """
+        while len(self.jobs) < self._count:
+            name = f"flexdt-{self._made}"
+            with tempfile.TemporaryDirectory() as folder:
+                file = Path(folder) / "job.sh"
+                file.write_text(self._script.replace(PLACEHOLDER, name), encoding="utf-8")
+                said = _run("sbatch", str(file))
+            found = re.search(r"\d+", said.stdout)
+            if said.returncode or found is None:
+                raise CommandError(f"sbatch refuses the job: {_words(said)}", REFUSED)
+            self._made += 1
+            self.jobs.append(Job(found[0], name))
+
+    def tend(self, workers: Collection[str]) -> list[str]:
+        """Submit again what has left the queue; what there is to say.
+
+        Args:
+            workers: names of those that are connected.
+
+        Raises:
+            CommandError: jobs end before a worker of theirs has come.
+        """
+        for job in self.jobs:
+            job.seen = job.seen or any(map(job.has, workers))
+        queue, lines = self._queue()
+        if queue is not None:
+            lines += self._replace([j for j in self.jobs if j.id not in queue], workers)
+        if not workers:
+            lines.append(self._waiting(queue or {}))
+        return lines
+
+    def close(self) -> None:
+        """Cancel all."""
+        if self.jobs:
+            _run("scancel", *(job.id for job in self.jobs))
+        self.jobs = []
+
+    def _queue(self) -> tuple[dict[str, str] | None, list[str]]:
+        """Job -> its state and why, as squeue has them; None where it does not answer."""
+        said = _run("squeue", "--noheader", "--me", "--format=%i %T (%r)")
+        if said.returncode:
+            return None, [f"squeue: {_words(said)}"]
+        rows = [line.split(maxsplit=1) for line in said.stdout.splitlines() if line.strip()]
+        return {row[0]: row[-1] for row in rows}, []
+
+    def _replace(self, gone: Sequence[Job], workers: Collection[str]) -> list[str]:
+        lines = []
+        for job in gone:
+            if any(map(job.has, workers)):
+                continue  # it is about to end
+            self.jobs.remove(job)
+            self._barren = 0 if job.seen else self._barren + 1
+            why = _outcome(job.id)
+            if self._barren >= BARREN:
+                raise CommandError(
+                    f"{BARREN} jobs have ended before a worker of theirs came, the last one, "
+                    f"{job.id}: {why}; slurm-{job.id}.out may say more",
+                    REFUSED,
+                )
+            lines.append(f"job {job.id} has ended ({why}); another one is submitted")
+        try:
+            self.submit()
+        except CommandError as error:
+            lines.append(str(error))
+        return lines
+
+    def _waiting(self, queue: Mapping[str, str]) -> str:
+        shown = [f"{job.id} {queue.get(job.id, 'UNKNOWN')}" for job in self.jobs[:SHOWN]]
+        more = len(self.jobs) - len(shown)
+        if not shown:
+            return "waits for workers: no job is in the queue"
+        return f"waits for workers of jobs {', '.join(shown)}{f' and {more} more' if more else ''}"
+
+
+def lifetime_s(walltime: str) -> int | None:
+    """When workers are to end by themselves, so that their tasks go on elsewhere in time [s].
+
+    Args:
+        walltime: as SLURM reads it: minutes, MM:SS, HH:MM:SS, D-HH, D-HH:MM or D-HH:MM:SS.
+
+    Returns:
+        A minute, or a twentieth, before the walltime is over; None where it is that short, or not
+        of these forms.
+
+    Example:
+        >>> lifetime_s("01:00:00"), lifetime_s("2-00:00:00"), lifetime_s("UNLIMITED")
+        (3420, 164160, None)
+    """
+    found = re.fullmatch(r"(?:(\d+)-)?(\d+)(?::(\d+))?(?::(\d+))?", walltime.strip())
+    if found is None:
+        return None
+    days, *rest = (None if part is None else int(part) for part in found.groups())
+    given = [part for part in rest if part is not None]
+    if days is not None or len(given) == 3:
+        hours, minutes, seconds = (*given, 0, 0)[:3]
+    else:
+        hours, (minutes, seconds) = 0, (*given, 0)[:2]
+    total = ((days or 0) * 24 + hours) * 3600 + minutes * 60 + seconds
+    return total - max(60, total // 20) if total > 180 else None
+
+
+def _outcome(job: str) -> str:
+    """How a job ended, as sacct has it."""
+    said = _run("sacct", "--noheader", "--parsable2", "--format=State,ExitCode", f"--jobs={job}")
+    lines = said.stdout.split()
+    return (
+        lines[0].replace("|", ", exit code ") if not said.returncode and lines else "left the queue"
+    )
+
+
+def _words(said: subprocess.CompletedProcess[str]) -> str:
+    """What a command said, in one line."""
+    text = said.stderr.strip() or said.stdout.strip() or f"exit code {said.returncode}"
+    return " ".join(text.split())
+
+
+def _run(*words: str) -> subprocess.CompletedProcess[str]:
+    """Run one of SLURM's commands; one that is not there or does not answer has failed."""
+    try:
+        return subprocess.run(
+            words, capture_output=True, text=True, errors="replace", timeout=ANSWER_S, check=False,
+            stdin=subprocess.DEVNULL, start_new_session=True,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired:
+        return subprocess.CompletedProcess(words, 1, "", f"no answer within {ANSWER_S:g} s")
+    except OSError as error:
+        return subprocess.CompletedProcess(words, 1, "", f"{words[0]}: {error.strerror}")
+
+
+Tend = Callable[[Collection[str]], list[str]]
+"""What there is to do and to say about a cluster, from the names of its connected workers."""
