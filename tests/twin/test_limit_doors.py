@@ -215,6 +215,24 @@ def test_rates_beyond_the_greatest_have_the_same_rule(number: int) -> None:
             assert scanner.settings(name)[0] == min(command.speed, axis.max_speed)
 
 
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_what_is_no_number_is_refused_by_every_request(value: float) -> None:
+    machine = builtin_machine("flexray")
+    scanner = ScannerTwin(machine, profile_of(machine))
+    for axis in ("mag_det", "ver_obj"):
+        for refused in (
+            lambda axis=axis: scanner.move({axis: value}, 0.0),
+            lambda axis=axis: scanner.move({axis: value}, 0.0, relative=True),
+            lambda axis=axis: scanner.jog(axis, value, 1.0, 0.0),
+            lambda axis=axis: scanner.set_axis(axis, speed=value),
+            lambda axis=axis: scanner.set_axis(axis, acceleration=value),
+        ):
+            with pytest.raises(LimitError):
+                refused()
+    with pytest.raises(LimitError):
+        scanner.place({"mag_det": value}, 0.0)
+
+
 @pytest.mark.parametrize("seed", range(40))
 def test_decimal_steps_arrive_at_the_limit(seed: int) -> None:
     """Walks of decimal steps that end at a limit by decimal sums, of motors and coupled axes."""

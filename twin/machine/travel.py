@@ -68,7 +68,7 @@ def rate(machine: Machine, axis: str, what: Rate, value: float) -> Arrival:
     for motor, share in machine.moves(axis).items():
         a = machine.axes[motor]
         asked, most = value * abs(share), a.max_speed if what == "speed" else a.max_acceleration
-        if asked > most * (1.0 + SAME_PLACE):
+        if not asked <= most * (1.0 + SAME_PLACE):  # as one that is no number
             unit = f"{a.unit}/{'s' if what == 'speed' else 's2'}"
             told.append(f"{motor} {what} {asked:g} {unit} is above {most:g} {unit}")
             beyond = beyond or LimitError.of_axis(told[-1], motor, asked, most, unit)

@@ -214,8 +214,10 @@ def with_settings(
         ("speed", speed), ("acceleration", acceleration),
     )  # fmt: skip
     for what, value in asked:
-        above = () if value is None else rate(machine, axis, what, value).told
-        if value is None or not (above or any(value * s < LEAST_RATE for s in shares.values())):
+        if value is None:
+            continue
+        above = rate(machine, axis, what, value).told
+        if not above and all(value * share >= LEAST_RATE for share in shares.values()):
             continue
         low = LEAST_RATE / min(shares.values())
         axes = machine.axes
