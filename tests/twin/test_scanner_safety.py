@@ -40,6 +40,9 @@ class Wall:
         near = positions["mag_obj"] < self.mag_obj_below and positions["tra_obj"] >= 0.0
         return {("sample", "wall"): 0.0} if near else {}
 
+    def standing(self, positions: Mapping[str, float]) -> Wall:
+        return self
+
     def __call__(self, trajectories: Mapping[str, Trajectory], now: float) -> Touch | None:
         mag_obj_below = self.mag_obj_below
         end = max(now, *(t.end for t in trajectories.values()))

@@ -34,6 +34,34 @@ ACCURACY = (0.1, 0.02)
 
 
 @dataclass(frozen=True, eq=False)
+class SceneParts:
+    """What a scene is built from; see `build_scene`."""
+
+    machine: Machine
+    profile: Profile
+    sample: tuple[ConvexSolid, ...]
+    parameters: Offsets
+    margin_mm: float | None
+
+    @property
+    def mounts(self) -> tuple[str, ...]:
+        """Motors of stages on the turntable, which the scene has everywhere they can go."""
+        geometry = self.machine.geometry
+        return tuple(m for q in ("mount_x", "mount_y") for m in geometry.get(q, {}))
+
+    def at(self, positions: Mapping[str, float]) -> CollisionScene:
+        """The scene with those stages at the positions that motors have [mm]."""
+        axes = dict(self.machine.axes)
+        for name in self.mounts:
+            here = positions.get(name, axes[name].home)
+            axes[name] = axes[name].model_copy(update={"lower": here, "upper": here, "home": here})
+        standing = self.machine.model_copy(update={"axes": axes})
+        return build_scene(
+            standing, self.profile, self.sample, self.parameters, margin_mm=self.margin_mm
+        )
+
+
+@dataclass(frozen=True, eq=False)
 class CollisionScene:
     """What may touch what.
 
@@ -46,6 +74,7 @@ class CollisionScene:
         reach: (axes, 2) lower and upper position for which `distant` holds.
         home: (axes,) positions of motors that a pose leaves out.
         limits: margin, tolerance, accuracy.
+        parts: what it was built from; None for bodies of one's own.
     """
 
     axes: tuple[str, ...]
@@ -55,6 +84,7 @@ class CollisionScene:
     reach: FloatArray
     home: FloatArray
     limits: Limits
+    parts: SceneParts | None = None
     _separations: dict[tuple[int, int], Separate] = field(default_factory=dict, repr=False)
     """Made when first asked for. Threads that share a scene may make one twice, which costs only
     the work: what they make is equal, keeps nothing between calls, and is put in whole."""
@@ -182,7 +212,7 @@ def build_scene(
     bodies = stage_bodies(machine, profile, parameters)
     bodies += sample_bodies(machine, profile, sample, parameters)
     margin = machine.safety_margin_mm if margin_mm is None else margin_mm
-    return scene_of(
+    scene = scene_of(
         axes,
         bodies,
         {frozenset(pair) for pair in machine.allowed_contacts},
@@ -192,6 +222,7 @@ def build_scene(
         home=np.array([a.home for a in machine.axes.values()]),
         limits=Limits(margin, TOLERANCE_MM, ACCURACY),
     )
+    return replace(scene, parts=SceneParts(machine, profile, tuple(sample), parameters, margin_mm))
 
 
 def scene_of(

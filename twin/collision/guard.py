@@ -48,6 +48,16 @@ class SceneGuard:
         pair = min(near, key=lambda names: near[names])
         return Contact(pair, now, here, here, now, near[pair], free_before=False)
 
+    def standing(self, positions: Mapping[str, float]) -> SceneGuard:
+        """The guard with stages on the turntable where they stand: contacts as they are, and not
+        of all that such a stage can sweep with its sample.
+
+        Args:
+            positions: motor -> position [mm, deg].
+        """
+        parts = self.scene.parts
+        return self if parts is None or not parts.mounts else SceneGuard(parts.at(positions))
+
     def touching(
         self, positions: Mapping[str, float], *, deep: bool = False
     ) -> dict[tuple[str, str], float]:

@@ -167,10 +167,20 @@ class Lookahead:
         others = {n: d.ahead(self.now) for n, d in self.drives.items() if n not in trajectories}
         return self.guard({**others, **trajectories}, start)
 
-    def touching(self, *, deep: bool = False) -> Mapping[tuple[str, str], float]:
-        """Pairs within the safety margin now, as `Guard.touching`, wherever they are going."""
+    def touching(
+        self, *, deep: bool = False, standing: bool = False
+    ) -> Mapping[tuple[str, str], float]:
+        """Pairs within the safety margin now, as `Guard.touching`, wherever they are going.
+
+        Args:
+            deep: measure overlaps.
+            standing: of parts where they stand, as `Guard.standing` has them.
+        """
         here = {name: d.at(self.now).position(self.now) for name, d in self.drives.items()}
-        return {} if self.guard is None else self.guard.touching(here, deep=deep)
+        if self.guard is None:
+            return {}
+        guard = self.guard.standing(here) if standing else self.guard
+        return guard.touching(here, deep=deep)
 
     # Joining ------------------------------------------------------------------------------------
 
@@ -454,12 +464,7 @@ class StageChange:
         """Whether what is under way may carry on, or how it is halted; raises as `certified`."""
         changed, now = self.ahead.on(self.guard), self.ahead.now
         under_way = self.ahead.ahead()
-        before = self.ahead.touching(deep=True)
-        for pair, clearance in changed.touching(deep=True).items():
-            # What is within the margin already may stay there, and keeps its floor.
-            margin = self.ahead.machine.safety_margin_mm
-            if pair not in before or clearance < floor(before[pair], margin):
-                raise self._refused(pair, 0.0, {})
+        self._require_no_nearer(changed)
         contact = changed.contact(under_way) if under_way else None
         halted: Trajectories = {}
         if contact is not None:
@@ -472,6 +477,23 @@ class StageChange:
             if met is not None:
                 raise self._refused(met.pair, met.time - now, met.last_free)
         return Joined(halted, contact)
+
+    def _require_no_nearer(self, changed: Lookahead) -> None:
+        """What is within the margin already may stay there, and keeps its floor.
+
+        A sample on a stage of the turntable counts wherever that can bring it. So what is near
+        already is measured where it stands as well: else the reach of one sample would excuse
+        another that really overlaps.
+        """
+        margin = self.ahead.machine.safety_margin_mm
+        for standing in (False, True):
+            after = changed.touching(deep=True, standing=standing)
+            before = self.ahead.touching(deep=True, standing=standing) if after else {}
+            for pair, clearance in after.items():
+                if pair not in before or clearance < floor(before[pair], margin):
+                    raise self._refused(pair, 0.0, {})
+            if not after:
+                return
 
     def _refused(
         self, pair: tuple[str, str], seconds: float, last_free: Mapping[str, float]

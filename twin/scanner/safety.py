@@ -89,6 +89,9 @@ class Guard(Protocol):
         An overlap has 0, or (`deep`) how deep it is as a negative one.
         """
 
+    def standing(self, positions: Mapping[str, float]) -> Guard:
+        """The guard of the same parts where they stand at a pose, without what they may sweep."""
+
 
 def require_ready(safety: Safety, what: str) -> None:
     """Raise unless motion is allowed.
