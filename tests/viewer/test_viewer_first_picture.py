@@ -16,7 +16,7 @@ from PIL import Image
 from scipy.spatial import ConvexHull
 
 from flexdt.clients.client.client import TwinClient
-from flexdt.clients.viewer.scenes.meshes.cabinet import cabinet
+from flexdt.clients.viewer.scenes.meshes.cabinet import cabinet, room_of
 from flexdt.clients.viewer.scenes.still import Shape, drawn
 from flexdt.clients.viewer.scenes.views import ROOM, WIDE, Standpoint, fitted, presets, roomy
 from flexdt.clients.viewer.scenes.world import World, placed
@@ -109,7 +109,7 @@ def test_large_triangles_that_reach_behind_the_eye_do_not_break_a_picture() -> N
 
 
 def test_the_cabinet_never_stands_between_a_camera_outside_and_the_machine() -> None:
-    pieces, lamp = cabinet(builtin_machine(), -405.0)
+    pieces, lamp = cabinet(room_of(builtin_machine()))
     triangles = np.concatenate([p.mesh.triangles for p in pieces if p.mesh.extents.max() < 2400.0])
     whole = np.concatenate([p.mesh.triangles for p in pieces]).reshape(-1, 3)
     low, high = whole.min(axis=0), whole.max(axis=0)

@@ -16,7 +16,12 @@ from flexdt.clients.viewer.scenes.beam_planes import LIGHT, BeamShade
 from flexdt.clients.viewer.scenes.drag_handles import Drag, Gizmos
 from flexdt.clients.viewer.scenes.lamps import light_plainly
 from flexdt.clients.viewer.scenes.layers import Nodes, Shown
-from flexdt.clients.viewer.scenes.meshes.cabinet import LAMP, cabinet, ground_of
+from flexdt.clients.viewer.scenes.meshes.cabinet import (
+    LAMP,
+    cabinet,
+    ground_of,
+    room_of,
+)
 from flexdt.clients.viewer.scenes.meshes.collision_bodies import bare, grown
 from flexdt.clients.viewer.scenes.meshes.painted_meshes import cylinder, glb, plain
 from flexdt.clients.viewer.scenes.meshes.paints import RUBBER
@@ -31,7 +36,8 @@ from flexdt.twin.collision.collision_scene import build_scene
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.description import Machine, Profile
 
-FLOOR_MM: Final = -405.0
+LAMP_M: Final = 0.045
+"""Radius of the cabinet's lamp in the FleX-ray."""
 CONE: Final = 0.2
 """Opacity of the whole beam in a picture that needs no browser."""
 BEAM_OFF: Final = (120, 140, 165)
@@ -100,11 +106,12 @@ class LabScene:
         scene.configure_default_lights(enabled=False, cast_shadow=False)
         light_plainly(scene)
         scene.world_axes.visible = False
+        room = room_of(self.machine)
         scene.add_grid(
             "/floor", width=8.0, height=8.0, cell_size=0.25, section_size=1.0,
             cell_color=FLOOR, section_color=FLOOR, cell_thickness=0.5,
             section_thickness=0.9, fade_distance=5.0, fade_strength=2.0,
-            position=(0.0, 0.55, FLOOR_MM * MM),
+            position=(0.0, 0.55, room.floor_mm * MM),
         )  # fmt: skip
         ground = ground_of(self.machine)
         for part in self.machine.components:
@@ -118,11 +125,15 @@ class LabScene:
                 position=tuple(np.array(part.mesh_at_mm if own else (0.0, 0.0, 0.0)) * MM),
                 receive_shadow=part is ground,  # a part's shadow on itself has stripes
             )  # fmt: skip
-        pieces, lamp = cabinet(self.machine, FLOOR_MM)
+        pieces, lamp = cabinet(room)
         self._solids["cabinet"], self._sent["cabinet"] = cut(pieces), HERE
         still: Any = {"cast_shadow": False, "receive_shadow": False}
         self._lamp = scene.add_icosphere(
-            "/cabinet/lamp", radius=0.045, color=LAMP[False], position=tuple(lamp * MM), **still
+            "/cabinet/lamp",
+            radius=LAMP_M * room.scale,
+            color=LAMP[False],
+            position=tuple(lamp * MM),
+            **still,
         )
         scene.add_glb("/cabinet/walls", glb(pieces), cast_shadow=False)
         self._frames["sample"] = scene.add_frame("/sample", show_axes=False)

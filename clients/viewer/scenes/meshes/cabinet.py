@@ -7,19 +7,28 @@ the operator has the door, with a window of lead glass and the lamp that says wh
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import trimesh
 
 from flexdt.clients.viewer.scenes.meshes.painted_meshes import Paint, PaintedMesh, bevelled
 from flexdt.clients.viewer.scenes.meshes.paints import ANODISED, SIGNAL, STEEL
+from flexdt.clients.viewer.scenes.meshes.part_looks import pieces_of
+from flexdt.twin.collision.stages import stage_bodies
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.machine.description import Component, Machine
+from flexdt.twin.machine.description import Component, Machine, profile_of
 
-ROOM_MM: Final = (150.0, 150.0, 450.0)
-"""Between the machine's largest part and the walls; above that part, what towers need and more."""
+DRAWN_FOR_MM: Final = (2000.0, 1390.0)
+"""What the FleX-ray's parts reach sideways and upwards, for which all lengths below hold; those of
+another machine are in proportion, by the smaller."""
+ROOM_MM: Final = (150.0, 150.0, 350.0)
+"""Between whatever the machine's parts reach and the walls; above it, what lamps need and more."""
+BELOW_MM: Final = 45.0
+"""From the lowest part to the floor."""
 DOOR_MM: Final = (900.0, 1050.0)
+EDGE_MM: Final = 2.0
+"""Cut off the edges of blocks."""
 WALL = Paint((208, 213, 220), 0.0, 0.9)
 FLOOR = Paint((120, 127, 138), 0.0, 0.95)
 DOOR = Paint((232, 236, 241), 0.0, 0.7)
@@ -33,45 +42,91 @@ def ground_of(machine: Machine) -> Component:
     return max(machine.components, key=lambda part: part.size_mm[0] * part.size_mm[1])
 
 
-def cabinet(machine: Machine, floor_mm: float) -> tuple[list[PaintedMesh], FloatArray]:
-    """The cabinet's pieces, and where its lamp is, (3,).
+class Room(NamedTuple):
+    """Where a machine stands.
 
-    Args:
-        machine: around the largest of whose parts it stands.
+    Attributes:
+        low, high: corners of all that its parts reach, (3,) [mm].
+        scale: how large it is beside the FleX-ray.
         floor_mm: height of the floor.
     """
-    ground = ground_of(machine)
-    towers = max(part.size_mm[2] for part in machine.components)
-    half = np.array(ground.size_mm) / 2 + ROOM_MM
-    low = np.array(ground.center_mm) - half
-    high = np.array(ground.center_mm) + half
-    low[2], high[2] = floor_mm, ground.center_mm[2] + towers + ROOM_MM[2]
+
+    low: FloatArray
+    high: FloatArray
+    scale: float
+    floor_mm: float
+
+
+def room_of(machine: Machine) -> Room:
+    """The room that a machine needs."""
+    low, high = reach_of(machine)
+    across, tall = (high - low)[:2].max(), (high - low)[2]
+    scale = float(min(across / DRAWN_FOR_MM[0], tall / DRAWN_FOR_MM[1]))
+    return Room(low, high, scale, float(low[2]) - BELOW_MM * scale)
+
+
+def reach_of(machine: Machine) -> tuple[FloatArray, FloatArray]:
+    """Lowest and highest corner of all that the machine's parts, as they are drawn, reach over
+    their travel, (3,)."""
+    limits = np.array([(axis.lower, axis.upper) for axis in machine.axes.values()])
+    bodies = {body.name: body for body in stage_bodies(machine, profile_of(machine))}
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for part in machine.components:
+        body = bodies[part.name]
+        corners = np.concatenate([piece.mesh.vertices for piece in pieces_of(part)])
+        if body.turns.any():  # at any angle
+            radius = float(np.linalg.norm(corners[:, :2], axis=1).max())
+            corners = np.concatenate([corners, np.array([[-radius] * 2 + [0], [radius] * 2 + [0]])])
+        ends = body.slides[None] * limits.T[:, :, None]
+        low = np.minimum(low, body.origin + corners.min(axis=0) + ends.min(axis=0).sum(axis=0))
+        high = np.maximum(high, body.origin + corners.max(axis=0) + ends.max(axis=0).sum(axis=0))
+    return low, high
+
+
+def cabinet(room: Room) -> tuple[list[PaintedMesh], FloatArray]:
+    """The cabinet's pieces, and where its lamp is, (3,); it stands around all that the machine's
+    parts reach."""
+    s = room.scale
+    low, high = room.low - s * np.array(ROOM_MM), room.high + s * np.array(ROOM_MM)
+    low[2] = room.floor_mm
     (x0, y0, z0), (x1, y1, _) = low, high
-    door_y, (wide, door_top) = 0.3 * y0 + 0.7 * y1, (DOOR_MM[0], z0 + DOOR_MM[1])
+    door_y, (wide, tall) = 0.3 * y0 + 0.7 * y1, s * np.array(DOOR_MM)
+    door_top = z0 + tall
     left, right = door_y - wide / 2, door_y + wide / 2
-    room = trimesh.creation.box(bounds=[low, high])
-    upward = room.face_normals[:, 2].copy()
-    room.invert()  # it is seen from within
-    walls, floor = room, room.copy()
+    walls = trimesh.creation.box(bounds=[low, high])
+    upward = walls.face_normals[:, 2].copy()
+    walls.invert()  # they are seen from within
+    floor = walls.copy()
     walls.update_faces(abs(upward) < 0.5)
     floor.update_faces(upward < -0.5)
-    middle, tall = (door_top + z0) / 2, DOOR_MM[1]
+    middle = (door_top + z0) / 2
+
+    def block(
+        size: tuple[float, ...], at: tuple[float, ...], paint: Paint, edge: float = EDGE_MM
+    ) -> PaintedMesh:
+        return bevelled(size, at, paint, edge * s)
+
+    pane = door_top - 280 * s
     on_wall = [
-        bevelled((8, wide + 60, tall + 60), (x0 + 4, door_y, middle), ANODISED),
-        bevelled((14, wide, tall), (x0 + 7, door_y, middle), DOOR, 4.0),
-        bevelled((18, 440, 340), (x0 + 9, door_y, door_top - 280), ANODISED),
-        bevelled((20, 400, 300), (x0 + 10, door_y, door_top - 280), GLASS),
-        bevelled((40, 26, 220), (x0 + 30, left + 90, door_top - 560), STEEL, 8.0),
-        bevelled((16, 150, 150), (x0 + 9, right - 170, door_top - 590), SIGNAL),
+        block((8 * s, wide + 60 * s, tall + 60 * s), (x0 + 4 * s, door_y, middle), ANODISED),
+        block((14 * s, wide, tall), (x0 + 7 * s, door_y, middle), DOOR, 4.0),
+        block((18 * s, 440 * s, 340 * s), (x0 + 9 * s, door_y, pane), ANODISED),
+        block((20 * s, 400 * s, 300 * s), (x0 + 10 * s, door_y, pane), GLASS),
+        block(
+            (40 * s, 26 * s, 220 * s), (x0 + 30 * s, left + 90 * s, door_top - 560 * s), STEEL, 8.0
+        ),
+        block(
+            (16 * s, 150 * s, 150 * s), (x0 + 9 * s, right - 170 * s, door_top - 590 * s), SIGNAL
+        ),
     ]
     for piece in on_wall:  # as the wall, it is seen from within alone
         piece.mesh.update_faces(piece.mesh.face_normals[:, 0] > 0.2)
     kerb = [
-        bevelled((x1 - x0 + 80, 40, 60), (0.5 * (x0 + x1), y, z0 + 30), STEEL)
-        for y in (y0 - 20, y1 + 20)
+        block((x1 - x0 + 80 * s, 40 * s, 60 * s), (0.5 * (x0 + x1), y, z0 + 30 * s), STEEL)
+        for y in (y0 - 20 * s, y1 + 20 * s)
     ] + [
-        bevelled((40, y1 - y0, 60), (x, 0.5 * (y0 + y1), z0 + 30), STEEL)
-        for x in (x0 - 20, x1 + 20)
+        block((40 * s, y1 - y0, 60 * s), (x, 0.5 * (y0 + y1), z0 + 30 * s), STEEL)
+        for x in (x0 - 20 * s, x1 + 20 * s)
     ]
     pieces = [PaintedMesh(walls, WALL), PaintedMesh(floor, FLOOR), *on_wall, *kerb]
-    return pieces, np.array([x0 + 45.0, door_y, door_top + 130.0])
+    return pieces, np.array([x0 + 45.0 * s, door_y, door_top + 130.0 * s])
