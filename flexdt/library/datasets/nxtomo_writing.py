@@ -15,11 +15,15 @@ from flexdt.library.datasets.image_set import ImageSet, references
 from flexdt.library.extras import package
 from flexdt.runtime.files.whole_files import whole_file
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
+from flexdt.twin.physics.tube import tube_spectrum, voltages
 from flexdt.twin.signatures import File
 
 PROJECTION, FLAT, DARK = 0, 1, 2
 """Image keys of NXtomo."""
 INVALID: Final = 3
+HALF_SEEN: Final = 0.5
+"""Share of the panel's longer side of the rotation axis that its shorter one has, below which the
+field of view is half: the views of a whole turn complete each other."""
 KEYS: Final = {"di": DARK, "io": FLAT}
 """Image keys of what the scanner calls so."""
 
@@ -69,6 +73,8 @@ def _write(data: ImageSet, out: Any) -> None:
     for name, value in lengths.items():
         _measured(detector, name, value, "mm")
     _measured(source, "distance", -to_source, "mm")
+    detector["field_of_view"] = _field_of_view(axis_column, data.shape[1])
+    _write_exposure(data, keys, entry, instrument)
     _measured(detector, "x_rotation_axis_pixel_position", axis_column, "px")
     _measured(detector, "y_rotation_axis_pixel_position", axis_row, "px")
 
@@ -85,6 +91,55 @@ def _write(data: ImageSet, out: Any) -> None:
 
     own = _group(entry, "flexdt", "NXcollection")
     _measured(own, "cone_vec", geometry.rows, "mm")
+
+
+def _field_of_view(axis_column: float, columns: int) -> str:
+    """`Full`, or `Half` where the rotation axis is seen near a side of the panel."""
+    left, right = axis_column + 0.5, columns - 0.5 - axis_column
+    return "Half" if min(left, right) < HALF_SEEN * max(left, right) else "Full"
+
+
+def _write_exposure(data: ImageSet, keys: list[int], entry: Any, instrument: Any) -> None:
+    """Write tube and exposure, as far as they are known: count_time, energies, and the current of
+    each image as its monitor (`control`).
+
+    A tube has no one energy: `incident_energy` is the mean of flexdt's own spectrum, and the
+    source's energy is the end of it.
+    """
+    kV, power_W, exposure_ms = _exposure_of(data)
+    count = len(keys)
+    if exposure_ms is not None:
+        _measured(instrument["detector"], "count_time", np.full(count, exposure_ms / 1000.0), "s")
+    if kV is None:
+        return
+    source = instrument["source"]
+    _measured(source, "voltage", kV, "kV")
+    _measured(source, "energy", kV, "keV")
+    least, most = voltages()
+    if least <= kV <= most:
+        beam = _group(instrument, "beam", "NXbeam")
+        _measured(beam, "incident_energy", tube_spectrum(kV).mean_keV, "keV")
+        beam["incident_energy"].attrs["description"] = (
+            f"mean of flexdt's spectrum of a tungsten anode at {kV:g} kV"
+        )
+    if power_W is not None:
+        current_A = power_W / kV / 1000.0
+        _measured(source, "power", power_W, "W")
+        _measured(source, "current", current_A, "A")
+        control = _group(entry, "control", "NXmonitor")
+        lit = np.where(np.array(keys) == DARK, 0.0, current_A)
+        _measured(control, "data", lit, "A")
+        control["data"].attrs["description"] = "current of the tube; there is no monitor"
+
+
+def _exposure_of(data: ImageSet) -> tuple[float | None, float | None, float | None]:
+    """Voltage [kV], power [W] and exposure of one image [ms], None where nothing says them."""
+    if data.settings is not None:
+        return data.settings.kV, data.settings.power_W, data.settings.exposure_ms
+    exposure = None if data.truth is None else data.truth.exposure
+    if exposure is None:
+        return None, None, None
+    return exposure.kV, exposure.power_W, exposure.exposure_ms
 
 
 def _group(parent: Any, name: str, kind: str) -> Any:
