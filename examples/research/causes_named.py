@@ -23,6 +23,7 @@ from faults_drawn import KINDS, Faulty, drawn
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.detection import Detections
+from flexdt.twin.calibration.fit.fit import image_quantities
 from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, SpotFrames, nothing
 from flexdt.twin.calibration.pipeline import Calibration, CalibrationRequest, Scan, calibrate
 from flexdt.twin.errors import TwinError
@@ -111,6 +112,12 @@ def _worst(result: Calibration, scan: Faulty) -> tuple[float, str]:
             middle = (low + high) / 2
             value = middle + (value - middle + 180.0) % 360.0 - 180.0
         off = max(low - value, value - high, 0.0) / max(e.sigma, 1e-12)
+        if off > worst:
+            worst, where = off, name
+    if any(low < high for low, high in scan.truth.values()) or scan.after is not None:
+        return worst, where
+    for name, e in image_quantities(result.fit)[0].items():
+        off = abs(e.value - scan.image.get(name, e.value)) / max(e.sigma, 1e-12)
         if off > worst:
             worst, where = off, name
     return worst, where

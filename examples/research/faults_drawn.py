@@ -38,6 +38,8 @@ class World:
         spot: (n, 3) of the focal spot [mm].
         shown: (n, k) balls that are in the images.
         sod, sdd, pixel: [mm].
+        arc: the object turns by so much while a frame is exposed [deg].
+        size: (n,) of the phantom in each frame, as a factor; None: it stays.
     """
 
     beads: Array
@@ -49,6 +51,8 @@ class World:
     sod: float
     sdd: float
     pixel: float = PIXEL
+    arc: float = 0.0
+    size: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,14 +92,48 @@ class Faulty:
     noise_px: float
     shape: tuple[int, int] = SHAPE
     after: Callable[[list[Array | None]], list[Array | None]] | None = None
+    image: Mapping[str, float] = field(default_factory=dict)
+
+
+def in_images(world: World) -> dict[str, float]:
+    """Column of the axis in the middle row [px], and magnification of a short line on the axis
+    along the panel's rows, in the first frame."""
+    still = {n: float(np.ravel(v)[0]) for n, v in world.offsets.items()}
+    tau = np.array([still.get("tau_x", 0.0), still.get("tau_z", 0.0), 0.0])
+    reach = 0.5
+    points = tau + np.array(
+        [[0, 0, 9.0], [0, 0, -9.0], [reach, 0, 0], [-reach, 0, 0], [0, reach, 0], [0, -reach, 0]]
+    )
+    first = replace(
+        world, beads=points, radii=np.full(6, 1e-4), offsets=still, angles=world.angles[:1],
+        spot=world.spot[:1], shown=np.ones((1, 6), dtype=bool), arc=0.0, size=None,
+    )  # fmt: skip
+    ((up, down, *ends),) = shadows(first)[0]
+    middle = (SHAPE[0] - 1) / 2
+    column = down[0] + (up[0] - down[0]) * (middle - down[1]) / (up[1] - down[1])
+    # A horizontal line that the panel shows along its rows, of the two that were projected.
+    turn = math.radians(float(world.angles[0]) + still.get("alpha", 0.0))
+    along = math.cos(turn) * (ends[0] - ends[1]) + math.sin(turn) * (ends[2] - ends[3])
+    return {"axis_column": float(column), "magnification": float(np.linalg.norm(along))
+            * world.pixel / (2 * reach)}  # fmt: skip
 
 
 def shadows(world: World) -> tuple[Array, Array]:
-    """Centres (n, k, 2) and radii (n, k) [px] of the outlines of the balls' shadows.
+    """Centres (n, k, 2) and radii (n, k) [px] of the outlines of the balls' shadows, the means of
+    each exposure.
 
     The source is near the origin, the beam along +y, z up; a growing angle turns the object
     clockwise seen from above.
     """
+    if world.arc:
+        # Legendre's points and weights of an even turn.
+        points, weights = np.polynomial.legendre.leggauss(9)
+        some = [
+            shadows(replace(world, angles=world.angles + 0.5 * world.arc * p, arc=0.0))
+            for p in points
+        ]
+        both = [sum(w * part[i] for w, part in zip(weights / 2, some, strict=True)) for i in (0, 1)]
+        return np.asarray(both[0]), np.asarray(both[1])
     n = len(world.angles)
 
     def of(name: str) -> Array:
@@ -118,7 +156,8 @@ def shadows(world: World) -> tuple[Array, Array]:
     radii = np.empty((n, len(world.beads)))
     round_ = 2 * math.pi * np.arange(TOUCHING) / TOUCHING
     for i in range(n):
-        at = lean[i].apply(spin[i].apply(world.beads - tau[i])) + foot[i] - world.spot[i]
+        beads = world.beads * (1.0 if world.size is None else world.size[i])
+        at = lean[i].apply(spin[i].apply(beads - tau[i])) + foot[i] - world.spot[i]
         inverse = np.linalg.inv(np.stack([panel[i], *steps[i]], axis=1))
         for k, (ball, r) in enumerate(zip(at, world.radii, strict=True)):
             d2 = ball @ ball
@@ -202,6 +241,7 @@ def drawn(kind: str, seed: int) -> Faulty:
         draft.silent,
         draft.noise_px,
         after=draft.after,
+        image=in_images(draft.world),
     )
 
 
@@ -580,6 +620,128 @@ def _held_zero(*names: str) -> Fault:
     return fault
 
 
+def _usual(draft: Draft, rng: Rng) -> Draft:
+    """Panel and axis are not exactly where they are said to be, as usual."""
+    offsets = {name: float(rng.normal(0.0, width)) for name, width in UNSEEN.items()}
+    world = replace(draft.world, offsets={**offsets, **draft.world.offsets})
+    return replace(draft, world=world, beside=("priors_narrow",))
+
+
+def _right(draft: Draft, rng: Rng) -> Draft:
+    """A printed phantom as good as is assumed, in a scanner as good as is assumed."""
+    draft = _usual(draft, rng)
+    change = np.eye(3) + 1e-3 * rng.normal(size=(3, 3))
+    world = replace(draft.world, beads=draft.world.beads @ change.T)
+    return replace(draft, world=world, silent=True,
+                   names=("phantom_strained|priors_narrow",))  # fmt: skip
+
+
+def _strained(kind: str) -> Fault:
+    """The phantom is not as its file says, by 0.05 to 1 %."""
+
+    def fault(draft: Draft, rng: Rng) -> Draft:
+        draft = _usual(draft, rng)
+        size = _sign(rng) * math.exp(rng.uniform(math.log(5e-4), math.log(1e-2)))
+        change = np.eye(3)
+        i, j = {"x": (0, 0), "y": (1, 1), "z": (2, 2), "shear": (0, 1), "lean": (0, 2)}[kind]
+        change[i, j] += size
+        if kind == "shear":
+            change[1, 0] += size
+        world = replace(draft.world, beads=draft.world.beads @ change.T)
+        # What is within three sigmas of what is assumed of every phantom need not be said.
+        return replace(draft, world=world, names=("phantom_strained|bead_tolerance",),
+                       silent=abs(size) < 3e-3)  # fmt: skip
+
+    return fault
+
+
+def _exposed_long(draft: Draft, rng: Rng) -> Draft:
+    """A continuous scan: each exposure lasts a part of a step, or all of it."""
+    draft = _usual(draft, rng)
+    step = 360.0 / len(draft.world.angles)
+    share = float(rng.uniform(0.1, 1.0))
+    world = replace(draft.world, arc=share * step)
+    return replace(draft, world=world, names=("exposure_arc|turns while a frame is exposed",),
+                   silent=share * step < 3.0,
+                   beside=(*draft.beside, "causes_open", "phantom_strained"))  # fmt: skip
+
+
+def _renumbered(shift: int) -> Fault:
+    """From a frame on, images are those of `shift` frames later: -1 where one was doubled, 1 where
+    one was lost."""
+
+    def fault(draft: Draft, rng: Rng) -> Draft:
+        draft = _usual(draft, rng)
+        n = len(draft.world.angles)
+        at = int(rng.integers(1, n))
+        step = 360.0 / n
+        angles = draft.world.angles + step * shift * (np.arange(n) >= at)
+        world = replace(draft.world, angles=angles)
+        code = "frame_numbers" if at < n - 1 else "frames_inconsistent|frame_numbers"
+        return replace(draft, world=world, names=(rf"({code}).*\b({at}|{at - 1})\b",))
+
+    return fault
+
+
+def _exposed_again(draft: Draft, rng: Rng) -> Draft:
+    """One frame shows what the one before shows, of another exposure."""
+    draft = _usual(draft, rng)
+    at = int(rng.integers(1, len(draft.world.angles)))
+    angles = draft.world.angles.copy()
+    angles[at] = angles[at - 1]
+    world = replace(draft.world, angles=angles)
+    return replace(draft, world=world, names=(rf"frames_inconsistent.*\b{at}\b",))
+
+
+def _four_tiles(draft: Draft, rng: Rng) -> Draft:
+    """A panel of 2 x 2 tiles, each a little elsewhere."""
+    column = SHAPE[1] * rng.uniform(0.42, 0.58)
+    row = SHAPE[0] * rng.uniform(0.42, 0.58)
+    across, down = (float(_sign(rng) * rng.uniform(0.3, 2.0)) for _ in range(2))
+    askew = rng.normal(size=(2, 2)) * 0.1
+
+    def after(spots: list[Array | None]) -> list[Array | None]:
+        for s in spots:
+            assert s is not None
+            right, low = s[:, 0] > column, s[:, 1] > row
+            s[:, 0] += across * right + askew[0, 0] * low
+            s[:, 1] += down * low + askew[1, 1] * right
+        return spots
+
+    return _bent(draft, rng, after)
+
+
+def _source_jumps(draft: Draft, rng: Rng) -> Draft:
+    """The focal spot jumps aside; an object that jumps looks alike."""
+    draft = _usual(draft, rng)
+    n = len(draft.world.angles)
+    at = int(rng.integers(n // 4, 3 * n // 4))
+    way = np.array([_sign(rng) * rng.uniform(0.02, 0.3), 0.0, 0.0])
+    world = replace(draft.world, spot=(np.arange(n) >= at)[:, None] * way)
+    truth = {"dO_x": draft.world.offsets["dO_x"] + np.array([-1.0, 1.0]) * way[0]}
+    return replace(draft, world=world, names=(MOVES,), beside=OTHERS, truth=truth)
+
+
+def _grows(draft: Draft, rng: Rng) -> Draft:
+    """The phantom warms up during the scan."""
+    draft = _usual(draft, rng)
+    size = float(rng.uniform(5e-4, 7e-3))
+    n = len(draft.world.angles)
+    # All its lengths, so its distance too, are those of any frame.
+    world = replace(draft.world, size=1.0 + size * np.linspace(-0.5, 0.5, n))
+    dO_z = draft.world.offsets["dO_z"] + 0.5 * size * draft.world.sod * np.array([-1.0, 1.0])
+    return replace(draft, world=world, names=(f"{MOVES}|grows",), beside=OTHERS,
+                   truth={"dO_z": dO_z})  # fmt: skip
+
+
+def _other_pitch(draft: Draft, rng: Rng) -> Draft:
+    """Pixels are a little larger or smaller than is said."""
+    draft = _usual(draft, rng)
+    factor = 1.0 + _sign(rng) * rng.uniform(0.01, 0.08)
+    world = replace(draft.world, pixel=draft.world.pixel * factor)
+    return replace(draft, world=world, names=("pixel",), silent=False)
+
+
 ROLLS: Final = ("det_roll", "axis_tilt_z")
 LEANS: Final = ("dD_y", "det_pitch", "axis_tilt_x")
 TURNS: Final = ("dD_x", "det_yaw")
@@ -660,5 +822,19 @@ KINDS: Final[Mapping[str, Fault]] = {
     "height_held": _held("dO_y", 0.2, 2.0),
     "across_held": _held("dO_x", 0.2, 2.0),
     "scanner_held": _held_zero("dD_x", "dD_z", "det_roll", "det_yaw"),
+    "as_assumed": _right,
+    "strain_x": _strained("x"),
+    "strain_y": _strained("y"),
+    "strain_z": _strained("z"),
+    "strain_shear": _strained("shear"),
+    "strain_lean": _strained("lean"),
+    "exposed_long": _exposed_long,
+    "frame_doubled": _renumbered(-1),
+    "frame_lost": _renumbered(1),
+    "exposed_again": _exposed_again,
+    "four_tiles": _four_tiles,
+    "source_jumps": _source_jumps,
+    "grows": _grows,
+    "other_pitch": _other_pitch,
 }  # fmt: skip
 """Every fault."""

@@ -18,9 +18,10 @@ from flexdt.twin.calibration.fit.fitted_motion import (
 )
 from flexdt.twin.calibration.fit.problem import (
     SIX,
+    Strain,
 )
 from flexdt.twin.calibration.outcome import Calibration
-from flexdt.twin.calibration.request import CalibrationRequest, priors_of
+from flexdt.twin.calibration.request import CalibrationRequest, priors_of, strain_prior
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.panel import PanelModel
 from flexdt.twin.geometry.poses import Poses
@@ -65,12 +66,13 @@ def fit_scans(
     start: Sequence[Offsets] | None = None,
     bead_tolerance_mm: float | None = None,
     panel: PanelModel | None = None,
+    strain: Strain | None = None,
+    arc: bool = False,
 ) -> FitResult:
     """Fit to the best positions there are: of the second measurement, else of the first."""
     tolerance = request.bead_tolerance_mm if bead_tolerance_mm is None else bead_tolerance_mm
     seen = state.measured or state.identifications
-    # Spots that were found by us in the first measurement count alike.
-    weighed = bool(state.measured) or all(scan.index is not None for scan in state.scans)
+    weighed = positions_weighed(state)
     frames = [len(scan.poses) for scan in state.scans]
     sizes = np.array([scan.frames.shape for scan in state.scans], dtype=np.float64)
     fit = estimate_geometry(
@@ -93,6 +95,8 @@ def fit_scans(
         bound=request.bound,
         centre=np.concatenate([s.bias for s in seen]),
         panel=panel,
+        strain=strain_prior(state.model, request) if strain is None else strain,
+        arc=arc,
     )
     return fit if state.motion is None else aware(fit, state.motion)
 
@@ -107,18 +111,22 @@ def refit_scans(
     bead_tolerance_mm: float | None = None,
     start: Sequence[Offsets] | None = None,
     panel: PanelModel | None = None,
+    strain: Strain | None = None,
+    arc: bool | None = None,
 ) -> FitResult:
-    """Fit once more with something else free: more parameters, the beads, the panel's distortion.
+    """Fit once more with something else free: more parameters, or causes of the residuals.
 
     Args:
         state: the scans, and what was measured in them.
         request: what is free otherwise.
-        fit: the last one; the distortion that it found stays.
+        fit: the last one; distortion, strain and arc that it has stay.
         extra: parameters that are free as well.
         motion: of the scans; None: as in `state`.
         bead_tolerance_mm: prior of the beads' places; None: the request's.
         start: offsets of each scan; None: those of the last fit.
         panel: distortion to estimate; None: the last fit's.
+        strain: prior of the phantom's strains; None: the last fit's.
+        arc: whether an exposure lasts a part of the step; None: as in the last fit.
     """
     if motion is not None:
         scans = zip(state.scans, motion.motions, strict=True)
@@ -126,4 +134,13 @@ def refit_scans(
         state = replace(state, scans=moved)
     begin = fit.group_parameters if start is None else start
     freed = replace(request, free=tuple(dict.fromkeys((*request.free, *extra))))
-    return fit_scans(state, freed, begin, bead_tolerance_mm, panel or fit.problem.panel)
+    turning = fit.problem.curvature is not None if arc is None else arc
+    return fit_scans(
+        state, freed, begin, bead_tolerance_mm, panel or fit.problem.panel,
+        fit.strain_prior if strain is None else strain, turning,
+    )  # fmt: skip
+
+
+def positions_weighed(state: Calibration) -> bool:
+    """Whether positions have sigmas of their own: those of the first measurement count alike."""
+    return bool(state.measured) or all(scan.index is not None for scan in state.scans)

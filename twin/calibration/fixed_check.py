@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from flexdt.twin.calibration.diagnose import Finding, listed
+from flexdt.twin.calibration.diagnose.causes import Known
 from flexdt.twin.calibration.diagnose.fitted import (
     OF_RESIDUALS,
     explain_residuals,
@@ -22,20 +23,26 @@ from flexdt.twin.calibration.diagnose.fixed_parameters import (
     narrow_priors,
 )
 from flexdt.twin.calibration.fit.certificate import widened
-from flexdt.twin.calibration.fit.fit import FitResult
+from flexdt.twin.calibration.fit.fit import FitResult, Solver
 from flexdt.twin.calibration.fit.priors import ASSUMED, FIXED
 from flexdt.twin.calibration.fit.problem import (
     SIX,
     from_printed_reading,
     to_printed_reading,
 )
-from flexdt.twin.calibration.fits_of_scans import fit_with_loose_priors, refit_scans
+from flexdt.twin.calibration.fits_of_scans import (
+    MEASURED,
+    fit_with_loose_priors,
+    positions_weighed,
+    refit_scans,
+)
 from flexdt.twin.calibration.outcome import Calibration
 from flexdt.twin.calibration.request import (
     ANYWHERE,
     CalibrationRequest,
     priors_of,
     stated_priors,
+    strain_prior,
     with_free,
 )
 from flexdt.twin.geometry.offsets import NAMES
@@ -48,11 +55,16 @@ def explain(
     state: Calibration, request: CalibrationRequest, fit: FitResult
 ) -> tuple[FitResult, list[Finding]]:
     """Explain the residuals of a fit; where beads or the panel do, fit with those free."""
+    weighed = positions_weighed(state)
+    known = Known(
+        strain_prior(state.model, request),
+        request.bead_tolerance_mm,
+        (MEASURED if weighed else Solver()).floor_px,
+    )
     return explain_residuals(
         fit,
-        free_beads=request.bead_tolerance_mm is not None,
+        known=known,
         refit=lambda **changes: refit_scans(state, request, fit, **changes),
-        loose=lambda: fit_with_loose_priors(state, request, fit),
         sigmas_known=bool(state.measured),
         misfit_px=request.misfit_px,
     )

@@ -2,32 +2,52 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import chain
+from typing import Final
 
+import numpy as np
+
+from flexdt.twin.calibration.bead_model import BeadModel
+from flexdt.twin.calibration.detect.detection import Detections
 from flexdt.twin.calibration.diagnose import Finding, listed
 from flexdt.twin.calibration.diagnose.data import WIDE_GATE_PX, explain_identification
 from flexdt.twin.calibration.diagnose.fitted import OF_MOTION
-from flexdt.twin.calibration.frame_source import FrameState, nothing
+from flexdt.twin.calibration.diagnose.frame_numbers import FrameNumbers, frame_numbers
+from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, Scan, nothing
 from flexdt.twin.calibration.identify import Identification, Search, attempt, identified
 from flexdt.twin.calibration.outcome import Calibration
 from flexdt.twin.calibration.request import CalibrationRequest
+
+NEAR_PX: Final = 3.0
+"""Typical distance of spots from beads above which an assignment tells nothing of the frames."""
+LEAST_TYPICAL_PX: Final = 0.3
+"""It is taken to be at least this: a part of a scan tells a geometry less well than the whole."""
 
 
 def identify_scans(state: Calibration, request: CalibrationRequest) -> Calibration:
     """Find which spot is which bead, scan by scan until one tells nothing."""
     out: list[Identification] = []
     findings: list[Finding] = []
-    for scan, some in zip(state.scans, state.looks, strict=True):
-        unseen = nothing(scan.frames.shape)
-        detections = [
-            unseen if look.state is FrameState.REPEATED else look.detections for look in some
-        ]
+    looks = list(state.looks)
+    for i, scan in enumerate(state.scans):
+        detections = _spots(scan, looks[i])
         if scan.index is not None:
             out.append(identified(scan.index, detections, request.start))
             continue
         seek = partial(attempt, detections, state.model, scan.poses, start=request.start)
         found = seek()
+        numbers = _numbers(found, detections, state.model, scan)
+        if numbers is not None and (odd := numbers.judged(scan.name)) is not None:
+            findings.append(odd)
+            if odd.forbids:
+                break
+            looks[i] = _without(looks[i], numbers.again.tolist())
+            detections = _spots(scan, looks[i])
+            seek = partial(attempt, detections, state.model, scan.poses, start=request.start)
+            found = seek()
         told = explain_identification(found, detections, state.model, scan.poses, scan.name)
         if request.per_frame and told is not None and told.code in OF_MOTION:
             # It may move, so its spots may be far from where one geometry has them.
@@ -37,4 +57,45 @@ def identify_scans(state: Calibration, request: CalibrationRequest) -> Calibrati
         if found is None:
             break
         out.append(found)
-    return replace(state, identifications=tuple(out)).with_findings(*findings)
+    found_so_far = replace(state, identifications=tuple(out), looks=tuple(looks))
+    return found_so_far.with_findings(*findings)
+
+
+def _spots(scan: Scan, looks: Sequence[FrameSpots]) -> list[Detections]:
+    """The spots of each frame, none of those that show another frame's."""
+    unseen = nothing(scan.frames.shape)
+    return [unseen if look.state is FrameState.REPEATED else look.detections for look in looks]
+
+
+def _without(looks: Sequence[FrameSpots], frames: Sequence[int]) -> tuple[FrameSpots, ...]:
+    """The looks with some frames that are not used."""
+    again = frozenset(frames)
+    return tuple(
+        replace(look, state=FrameState.REPEATED) if i in again else look
+        for i, look in enumerate(looks)
+    )
+
+
+def _numbers(
+    found: Identification | None,
+    detections: Sequence[Detections],
+    model: BeadModel,
+    scan: Scan,
+) -> FrameNumbers | None:
+    """Which angle each frame shows, where some frames do not agree with the others."""
+    counts = np.array([len(d) for d in detections])
+    if found is not None:
+        seen = (found.index >= 0).sum(axis=1)
+        if not ((counts >= 2) & (seen < 0.6 * counts)).any():
+            return None
+    n = len(counts)
+    parts = [slice(0, n // 2), slice(n // 2, n), slice(n // 4, n - n // 4)]
+    halves = (attempt(detections[part], model, scan.poses[part]) for part in parts)
+    for base in chain([found], halves):
+        if base is None or not base.typical_px < NEAR_PX:
+            continue
+        spread = max(base.typical_px, LEAST_TYPICAL_PX)
+        numbers = frame_numbers(detections, model.beads, scan.poses, base.parameters, spread)
+        if numbers is not None:
+            return numbers
+    return None

@@ -5,13 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
+from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.diagnose.fitted import (
     MISFIT_PX,
 )
-from flexdt.twin.calibration.fit.priors import FIXED, require_widths
+from flexdt.twin.calibration.fit.priors import ASSUMED, FIXED, require_widths
 from flexdt.twin.calibration.fit.problem import (
     SIX,
+    UNSTRAINED,
     Reading,
+    Strain,
     require_names,
     require_tolerance,
 )
@@ -27,6 +32,11 @@ ANYWHERE = 1e3
 """A prior [mm, deg] so wide that the images alone say where its parameter is."""
 
 
+STRAIN = 1e-3
+"""Standard deviation of the stretches and the shears of a phantom that states no
+tolerance; assumed: printed plastic shrinks by that and more."""
+
+
 @dataclass(frozen=True)
 class CalibrationRequest:
     """What to estimate and how.
@@ -38,7 +48,8 @@ class CalibrationRequest:
         start: offsets to begin with, and the centre of every prior; what is neither free nor has a
             prior stays there.
         bead_tolerance_mm: > 0: bead positions are unknowns with this prior. 0: they are where the
-            phantom says. None: unknowns only if the residuals ask for it.
+            phantom says. None: the phantom as a whole may be strained by STRAIN, and single beads
+            are unknowns only if the residuals ask for it.
         second_look: measure again where the first fit predicts the beads.
         priors: standard deviations [mm, deg, 1] in place of the scans' own; 0 is exactly known. The
             scans' apply to what is not free, these to anything.
@@ -99,6 +110,24 @@ def stated_priors(scans: Sequence[Scan], request: CalibrationRequest) -> dict[st
             if name not in request.free:
                 out[name] = max(out.get(name, 0.0), width)
     return out | {n: w for n, w in request.priors.items() if w > 0 or n not in request.free}
+
+
+def strain_prior(model: BeadModel, request: CalibrationRequest) -> Strain:
+    """Give the standard deviations of the phantom's stretches and shears [1].
+
+    It is 0 where beads are exactly where the phantom says (`bead_tolerance_mm` 0, or every offset
+    of the scanner stated as exact), or are unknowns themselves; less than STRAIN where the
+    phantom's own tolerance is.
+    """
+    if request.bead_tolerance_mm is not None:
+        return UNSTRAINED
+    if all(request.priors.get(name) == 0.0 for name in ASSUMED if name not in request.free):
+        return UNSTRAINED
+    reach = float(np.sqrt(np.mean(np.sum(model.beads**2, axis=1))))
+    if not model.tolerance_mm > 0 or not reach > 0:
+        return STRAIN, STRAIN
+    width = min(STRAIN, model.tolerance_mm / reach)
+    return width, width
 
 
 def with_free(request: CalibrationRequest, names: Sequence[str]) -> CalibrationRequest:

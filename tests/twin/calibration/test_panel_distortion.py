@@ -80,7 +80,8 @@ def test_the_document_comes_back_and_what_is_none_is_refused() -> None:
 
 @pytest.mark.slow
 def test_a_barrel_in_the_images_is_found_and_undone() -> None:
-    """Images of a renderer of its own are warped; the map then puts the spots where they were."""
+    """Images of a renderer of its own are warped; the map then puts the spots where they were. Of a
+    phantom that is known exactly: five beads do not tell a barrel from a strain of .1 %."""
     rng = np.random.default_rng(3)
     beads = np.array([[9, 4, -20], [-10, 6, -9], [4, -11, 1], [-3, 10, 12], [11, -2, 21.0]])
     angles, sod = 15.0 * np.arange(24), 420.0
@@ -94,7 +95,8 @@ def test_a_barrel_in_the_images_is_found_and_undone() -> None:
     ]
     poses = Poses.upright([0, 0, 0], [0, sod, 0], [0, SDD, 0], PIXEL, np.radians(angles))
     model = BeadModel(beads, np.full(5, 1.0))
-    result = calibrate([Scan(ArrayFrames(bent, SHAPE), poses)], model, CalibrationRequest())
+    request = CalibrationRequest(bead_tolerance_mm=0.0)
+    result = calibrate([Scan(ArrayFrames(bent, SHAPE), poses)], model, request)
     assert "panel_distorted" in [f.code for f in result.findings]
     assert result.identifiable
     assert result.fit is not None

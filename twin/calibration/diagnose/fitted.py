@@ -8,17 +8,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from scipy.special import chdtri
 
 from flexdt.twin.calibration.camera_lag import Lag
 from flexdt.twin.calibration.detect.refine import Refined
 from flexdt.twin.calibration.diagnose import Finding, error, warning
-from flexdt.twin.calibration.diagnose.distortion import Refit, better_panel, distorted
-from flexdt.twin.calibration.fit.certificate import widened
+from flexdt.twin.calibration.diagnose.causes import Known, Refit, explained_by_causes
+from flexdt.twin.calibration.diagnose.frame_numbers import frame_numbers
+from flexdt.twin.calibration.diagnose.named_causes import named_causes
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.fit.fitted_motion import MotionFit, derivative, follow_motion
 from flexdt.twin.calibration.fit.residual_structure import MOVING
@@ -34,6 +33,8 @@ OF_RESIDUALS = frozenset(
 """Findings about what a fit leaves: they hold for that fit alone."""
 MISFIT_PX = 0.10
 """Residual of the final fit above which its numbers are not to be used unless explained."""
+BLOCK_SHARE = 0.7
+"""Part of the frames of a block, from the first or to the last of a scan, that do not fit."""
 MOST_USED = 0.9
 """Share of the positions below which a fit is good only because it left the others out."""
 NOISY = 1.5
@@ -86,7 +87,16 @@ def judge_places(fit: FitResult, looks: Sequence[Sequence[FrameSpots]]) -> Findi
     if not bad:
         return None
     n = len(detections)
-    block = len(bad) >= 2 and bad[-1] - bad[0] == len(bad) - 1 and (bad[0] == 0 or bad[-1] == n - 1)
+    spread = float(np.median(fit.certificate.rms_per_frame[seen > 0]))
+    if len(looks) == 1 and len(fit.group_parameters) == 1:
+        numbers = frame_numbers(
+            detections, fit.beads, fit.problem.poses, fit.parameters, 2.0 * spread
+        )
+        if numbers is not None and (odd := numbers.judged("the scan")) is not None:
+            return odd
+    # A frame of a block that happens to fit is of it all the same.
+    at_end = bad[0] == 0 or bad[-1] == n - 1
+    block = len(bad) >= 2 and at_end and len(bad) >= BLOCK_SHARE * (bad[-1] - bad[0] + 1)
     listed = f"{bad[0]} to {bad[-1]}" if block else ", ".join(str(i) for i in bad[:12])
     # A drift of something else leaves its ends out, too.
     if block and all(d.column.split("@")[0] == "alpha" for d in fit.certificate.drifts):
@@ -202,9 +212,8 @@ def judge_lag(lag: Lag) -> Finding:
 def explain_residuals(
     fit: FitResult,
     *,
-    free_beads: bool,
+    known: Known,
     refit: Refit,
-    loose: Callable[[], FitResult],
     sigmas_known: bool,
     misfit_px: float = MISFIT_PX,
 ) -> tuple[FitResult, list[Finding]]:
@@ -212,46 +221,31 @@ def explain_residuals(
 
     Args:
         fit: to be judged.
-        free_beads: the beads' positions are unknowns of it.
+        known: what is said of the phantom and the positions.
         refit: fits again with something else free.
-        loose: fits again with loosened priors.
         sigmas_known: the positions' sigmas were measured, and are no more than compared.
         misfit_px: residual above which the fit explains nothing, if noise does not.
 
     Returns:
-        The fit to be reported (bead positions freed where they explain the residuals) and the
-        findings.
+        The fit to be reported (with the causes that explain the residuals) and the findings.
     """
     if not fit.identifiable:
         return fit, []
-    flat, fit = fit, better_panel(fit, refit, loose, misfit_px)
-    told = distorted(fit, flat)
-    if fit is not flat and told is None:  # Either may be right: the interval has both.
-        off = {n: flat.values.get(n, v) - v for n, v in fit.values.items()}
-        fit = replace(fit, certificate=widened(fit.certificate, off))
+    plain = fit
+    fit, causes = explained_by_causes(fit, known, refit)
+    told = named_causes(fit, plain, causes)
     certificate = fit.certificate
-    out = [*_lost_beads(fit), *_drifts(fit), *([] if told is None else [told])]
+    out = [*_lost_beads(fit), *_drifts(fit), *told]
     noisy = sigmas_known and certificate.noise < NOISY
     bad = certificate.rms_px >= misfit_px and not noisy
-    structured = (
-        certificate.enlargement > 1.0
-        or certificate.shared
-        or certificate.turning
-        or bool(certificate.drifts)
-    )
-    if certificate.rms_px < 0.03 or not (structured or bad):
-        return fit, out
-    if bad or certificate.used.sum() < MOST_USED * fit.problem.seen.sum():
-        turned = _angle_scale(fit, refit)
+    if bad or plain.certificate.used.sum() < MOST_USED * plain.problem.seen.sum():
+        turned = _angle_scale(plain, refit)
         if turned is not None:
-            return fit, [turned]
-    if not free_beads and (better := _beads(fit, refit)) is not None:
-        result, finding = better
-        return result, [*_lost_beads(result), *_drifts(result), finding]
+            return plain, [turned]
     if not bad:
         return fit, out
     # What else the residuals show has no meaning where no cause explains them.
-    explained = moving(fit, lambda motion: refit(motion=motion)) or error(
+    explained = moving(plain, lambda motion: refit(motion=motion)) or error(
         "misfit",
         f"the fit leaves residuals of {certificate.rms_px:.2f} px, and no cause that is looked for "
         "explains them: check that nothing is loose, or let frames differ, --per-frame "
@@ -330,35 +324,6 @@ def _angle_scale(fit: FitResult, refit: Refit) -> Finding | None:
         "angle_endpoint" if known else "angle_scale",
         f"the frame angles are off by a factor {estimate.value:.5f}{known}; correct them, or free "
         "angle_scale",
-    )
-
-
-def _beads(fit: FitResult, refit: Refit) -> tuple[FitResult, Finding] | None:
-    """Bead positions off their model: fit them with a prior that their scatter suggests."""
-    k = len(fit.problem.model)
-    observable = 3 * k - 7  # less a rigid motion and a scale
-    if observable < 2:
-        return None
-    tolerance = 0.3
-    better = fit
-    for _ in range(4):
-        better = refit(bead_tolerance_mm=tolerance)
-        moved = better.beads - fit.problem.model.beads
-        fresh = max(float(np.sqrt(np.sum(moved**2) / observable)), 1e-4)
-        if abs(fresh - tolerance) < 0.1 * tolerance:
-            break
-        tolerance = fresh
-    # A scatter estimated from few beads may be twice as large: the intervals have to hold then.
-    tolerance *= float(np.sqrt(observable / chdtri(observable, 0.95)))
-    better = refit(bead_tolerance_mm=tolerance)
-    moved = np.linalg.norm(better.beads - fit.problem.model.beads, axis=1)
-    # A bead further off than its own radius is no bead of this phantom a little displaced.
-    if not _explained(better, fit) or (moved > fit.problem.model.bead_radius_mm).any():
-        return None
-    return better, warning(
-        "bead_tolerance",
-        f"the beads lie {1000 * float(moved.max()):.0f} um off their model at most; their "
-        f"positions were fitted too (prior {1000 * tolerance:.0f} um): wider intervals",
     )
 
 

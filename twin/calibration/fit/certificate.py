@@ -44,6 +44,13 @@ RANK_TOLERANCE = 1e-8
 """Singular values of the column-scaled Jacobian below this share of the largest are zero."""
 ROUNDING = 1e-9
 """Residuals of exact positions [whitened]; what they follow is rounding."""
+SOURCES = {
+    "bead": "beads",
+    "strain": "the phantom's scale",
+    "arc": "the exposure's arc",
+    "panel": "the panel's distortion",
+}
+"""What columns that are no parameters belong to, by the first word of their names."""
 WEAK_CONDITION = 500.0
 """A column-scaled condition number above this makes the smallest direction weak."""
 
@@ -372,7 +379,8 @@ def certify(
         spectrum, beads=beads, noise=noise * math.sqrt(enlargement), reported=asked, bound=bound
     )
     spec = judge(rows, names)
-    if asked < reported:
+    strained = range(problem.layout.bead_columns.stop, problem.layout.panel_column)
+    if asked < reported or strained:
         # What the residuals show beyond white noise does not widen priors.
         grown = noise * math.sqrt(enlargement) / prior_noise
         fair = rows.copy()
@@ -380,7 +388,7 @@ def certify(
         unit = spec.unit_covariance
         spec = replace(judge(fair, names), unit_covariance=unit)
         # Rank and condition say what the images tell of what was asked for, all else given.
-        given = [i for i in range(len(names)) if not asked <= i < reported]
+        given = [i for i in range(len(names)) if not asked <= i < reported and i not in strained]
         spec = _of_what_was_asked(judge(fair[:, given], [names[i] for i in given]), spec)
     factor = np.array([edge_factor(n) for n in names])
     # d(estimate) / d(prior mean), times the width of each prior
@@ -458,11 +466,11 @@ def spread_of_residuals(
 
 
 def _shares(names: Sequence[str], pull: FloatArray, sigma: float) -> dict[str, float]:
-    """What each prior adds to a sigma, largest first; the beads' and the panel's together."""
+    """What each prior adds to a sigma, largest first; those of one source together."""
     square: dict[str, float] = {}
     for name, value in zip(names, pull.tolist(), strict=True):
         kind = name.split(" ")[0]
-        source = {"bead": "beads", "panel": "the panel's distortion"}.get(kind, name)
+        source = SOURCES.get(kind, name)
         square[source] = square.get(source, 0.0) + value**2
     ordered = sorted(square.items(), key=lambda item: -item[1])
     return {n: math.sqrt(s) for n, s in ordered if s > 0.01 * sigma**2}

@@ -36,10 +36,12 @@ from flexdt.twin.calibration.fit.certificate import (
 from flexdt.twin.calibration.fit.priors import require_widths
 from flexdt.twin.calibration.fit.problem import (
     SIX,
+    UNSTRAINED,
     Centre,
     FitProblem,
     Reading,
     Shape,
+    Strain,
     build_problem,
     edge_factor,
     from_printed_reading,
@@ -280,6 +282,7 @@ class FitResult:
         problem: the problem that was solved, for further analysis.
         solution: column values.
         bead_prior_mm: standard deviation of the prior on bead positions; 0 if they were fixed.
+        strain_prior: that of the phantom's stretches and shears; 0 if it has its stated shape.
     """
 
     parameters: Offsets
@@ -294,6 +297,7 @@ class FitResult:
     problem: FitProblem
     solution: Solution
     bead_prior_mm: float = 0.0
+    strain_prior: Strain = UNSTRAINED
 
     @property
     def panel(self) -> Panel | None:
@@ -351,6 +355,8 @@ def estimate_geometry(
     prior_centre: Offsets | None = None,
     bound: float = BOUND,
     panel: PanelModel | None = None,
+    strain: Strain = UNSTRAINED,
+    arc: bool = False,
 ) -> FitResult:
     """Fit offsets (true minus nominal) to measured bead positions.
 
@@ -386,6 +392,8 @@ def estimate_geometry(
         prior_centre: the offsets those priors are centred on; None is the start of the first group.
         bound: sigma [mm, deg] beyond which a direction counts as not determined.
         panel: terms of a distortion of the panel, estimated too; None: it has none.
+        strain: standard deviations of the phantom's stretches and shears [1], estimated too.
+        arc: the object may turn while a frame is exposed, by an unknown share of a step.
 
     Returns:
         The fit with its certificate, also where not everything is determined.
@@ -408,6 +416,7 @@ def estimate_geometry(
         noise_px=noise_px, groups=groups, per_group=per_group, free_beads=free_beads, start=start,
         reading=reading, centre=centre, bead_tolerance_mm=tolerance,
         priors=require_widths(priors or {}), prior_centre=prior_centre, panel=panel,
+        strain=strain, arc=arc,
     )  # fmt: skip
     if not problem.seen.any():
         raise TwinError("no bead was seen in any frame: there is nothing to fit", {"seen": 0})
@@ -427,6 +436,7 @@ def estimate_geometry(
         problem=problem,
         solution=solution,
         bead_prior_mm=tolerance if free_beads else 0.0,
+        strain_prior=strain,
     )
 
 

@@ -33,6 +33,21 @@ SIX = ("dO_x", "dO_y", "dO_z", "alpha", "tau_x", "tau_z")
 EIGHT = (*SIX, "dD_x", "dD_y")
 """The thesis's extended vector, eq. 5.19."""
 
+STRAINS = ("scale", "xx", "yy", "zz", "xy", "xz", "zx", "yz", "zy")
+"""Growth of the whole, and displacements of beads along the first axis that grow with the second
+coordinate, but xy, which is the shear in both; a turn about the vertical is alpha."""
+STRETCHES = 4
+"""The first of them; the others are shears."""
+Strain = tuple[float, float]
+"""Standard deviations of stretches and of shears [1]; 0: there are none."""
+UNSTRAINED: Strain = (0.0, 0.0)
+LEAST_STRAIN = 1e-7
+"""Width of stretches or shears that are not there beside the others."""
+ARC_PRIOR = 0.5
+"""Standard deviation of the squared share of a step that an exposure lasts; it is 0 to 1."""
+ARC_ANGLE_RAD = 0.02
+"""Of the differences that give the curvature of the beads' paths."""
+
 GAUGES = (("dS_x", "dO_x", "dD_x"), ("dS_y", "dO_y", "dD_y"))
 """Shifting all three of a row together changes no image: the first is fixed when all are free."""
 
@@ -70,11 +85,14 @@ class ColumnLayout:
     """Which column of the normal equations means what.
 
     Attributes:
-        names: label of each column: a parameter, `parameter@group`, `bead k x|y|z`, or
-            `panel term`.
+        names: label of each column: a parameter, `parameter@group`, `bead k x|y|z`, `strain ab`,
+            `arc`, or `panel term`.
         asked: so many columns were asked for; those after them are there for their prior.
         colmap: (groups, 17) column of each group's parameter, -1 if not free.
         bead_column: first column of the beads' coordinates, -1 if fixed.
+        strain_column: first column of the phantom's strain, -1 if it has none.
+        arc_column: of the exposure's arc, -1 if it has none.
+        parameter_count: columns that are geometric parameters; all others come after.
         panel_column: first column of the panel's distortion, the last; as many as columns if none.
         active: indices of parameters that have a column in at least one group.
         held: parameters asked for but held by the gauge, with the reason.
@@ -84,14 +102,31 @@ class ColumnLayout:
     asked: int
     colmap: npt.NDArray[np.int64]
     bead_column: int
+    strain_column: int
+    arc_column: int
+    parameter_count: int
     panel_column: int
     active: npt.NDArray[np.int64]
     held: tuple[tuple[str, str], ...]
 
     @property
-    def parameter_count(self) -> int:
-        """Columns that are geometric parameters (the beads' and the panel's come after)."""
-        return self.panel_column if self.bead_column < 0 else self.bead_column
+    def bead_columns(self) -> slice:
+        """Columns of the beads' coordinates."""
+        if self.bead_column < 0:
+            return slice(self.parameter_count, self.parameter_count)
+        last = self.shift_column if self.strain_column < 0 else self.strain_column
+        return slice(self.bead_column, last)
+
+    @property
+    def strain_columns(self) -> slice:
+        """Columns of the phantom's strain, in the order of STRAINS."""
+        last = self.shift_column
+        return slice(last if self.strain_column < 0 else self.strain_column, last)
+
+    @property
+    def shift_column(self) -> int:
+        """First of the columns whose coefficients shift the positions: arc and panel."""
+        return self.panel_column if self.arc_column < 0 else self.arc_column
 
 
 def require_names(names: Iterable[str]) -> None:
@@ -127,6 +162,8 @@ def layout(
     free_beads: bool,
     priors: Sequence[str] = (),
     panel: Sequence[str] = (),
+    strained: bool = False,
+    arc: bool = False,
 ) -> ColumnLayout:
     """Assign columns.
 
@@ -138,6 +175,8 @@ def layout(
         free_beads: whether the beads' coordinates are unknowns too.
         priors: names of parameters with a prior; each has a column, asked for or not.
         panel: terms of the panel's distortion.
+        strained: whether the phantom may be strained.
+        arc: whether the object may turn while a frame is exposed.
 
     Raises:
         UnknownNameError: a name that is no parameter.
@@ -176,14 +215,24 @@ def layout(
             colmap[:, index] = len(names)
             names.append(name)
         asked = len(names) if name in wanted else asked
-    bead_column = -1
+    count = len(names)
+    bead_column = strain_column = arc_column = -1
     if free_beads:
         bead_column = len(names)
         names += [f"bead {k} {axis}" for k in range(beads) for axis in "xyz"]
+    if strained:
+        strain_column = len(names)
+        names += [f"strain {term}" for term in STRAINS]
+    if arc:
+        arc_column = len(names)
+        names.append("arc")
     panel_column = len(names)
     names += [f"panel {term}" for term in panel]
     active = np.array([NAMES.index(n) for n in (*wanted, *extra)], dtype=np.int64)
-    return ColumnLayout(tuple(names), asked, colmap, bead_column, panel_column, active, tuple(held))
+    return ColumnLayout(
+        tuple(names), asked, colmap, bead_column, strain_column, arc_column, count, panel_column,
+        active, tuple(held),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,6 +253,8 @@ class FitProblem:
         origin: (n, 2) pixel coordinates (column, row) of the detector's centre.
         prior_mean, prior_sigma: of each column, internal units; sigma inf where there is none.
         panel: terms of the panel's distortion; None: it has none.
+        curvature: (n, k, 2, 1) shifts of the positions by an exposure of a whole step, or
+            (n, k, 2, 0): each exposure is an instant.
     """
 
     poses: Poses
@@ -220,6 +271,7 @@ class FitProblem:
     prior_mean: FloatArray
     prior_sigma: FloatArray
     panel: PanelModel | None = None
+    curvature: FloatArray | None = None
 
     @property
     def start(self) -> FloatArray:
@@ -228,7 +280,7 @@ class FitProblem:
         free = self.layout.colmap >= 0
         x[self.layout.colmap[free]] = self.base[free]  # of a shared column, the last group's
         if self.layout.bead_column >= 0:
-            x[self.layout.bead_column : self.layout.panel_column] = self.model.beads.ravel()
+            x[self.layout.bead_columns] = self.model.beads.ravel()
         return x
 
     @cached_property
@@ -239,15 +291,56 @@ class FitProblem:
             np.column_stack([p.source, p.axis, p.detector, p.u, p.v, p.angle, p.mount[:, :2]]),
             self.group, self.reading.pivot, self.model.bead_radius_mm, self.bias,
             self.measured, self.whiten, self.layout.active, self.layout.colmap,
-            self.layout.bead_column, self.panel_terms,
+            self.layout.parameter_count if self._moved_beads else -1, self.shift_terms,
         )  # fmt: skip
+
+    @property
+    def _moved_beads(self) -> bool:
+        """The beads' places depend on columns."""
+        return self.layout.bead_column >= 0 or self.layout.strain_column >= 0
+
+    @cached_property
+    def strain_basis(self) -> FloatArray:
+        """(3 k, 9) displacement of the beads' coordinates [mm] by a unit of each strain."""
+        beads = self.model.beads
+        out = np.zeros((len(beads), 3, len(STRAINS)))
+        out[..., 0] = beads
+        for i, term in enumerate(STRAINS[1:], 1):
+            out[:, "xyz".index(term[0]), i] = beads[:, "xyz".index(term[1])]
+        out[:, 1, STRAINS.index("xy")] = beads[:, 0]
+        return out.reshape(-1, len(STRAINS))
+
+    @cached_property
+    def _columns_of_kernel(self) -> FloatArray | None:
+        """(kernel's columns, columns) by which kernel columns follow from those of the layout;
+        None: they are the same."""
+        if self.layout.strain_column < 0:
+            return None
+        count, own = self.layout.parameter_count, 3 * len(self.model)
+        shifts = len(self.layout.names) - self.layout.shift_column
+        out = np.zeros((count + own + shifts, len(self.layout.names)))
+        out[:count, :count] = np.eye(count)
+        if self.layout.bead_column >= 0:
+            out[count : count + own, self.layout.bead_columns] = np.eye(own)
+        out[count : count + own, self.layout.strain_columns] = self.strain_basis
+        out[count + own :, self.layout.shift_column :] = np.eye(shifts)
+        return out
 
     def spread(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Parameter sets (groups, 17) and beads (k, 3) for column values `x`."""
         columns, own = self.layout.colmap, self.layout.bead_column
         params = np.where(columns < 0, self.base, np.append(x, 0.0)[columns])
-        beads = self.model.beads if own < 0 else x[own : self.layout.panel_column].reshape(-1, 3)
+        beads = self.model.beads if own < 0 else x[self.layout.bead_columns].reshape(-1, 3)
+        if self.layout.strain_column >= 0:
+            beads = beads + (self.strain_basis @ x[self.layout.strain_columns]).reshape(-1, 3)
         return params, np.array(beads)
+
+    @cached_property
+    def shift_terms(self) -> FloatArray:
+        """(n, k, 2, m) shifts by a coefficient of 1 of the exposure's arc and the panel's terms."""
+        if self.curvature is None:
+            return self.panel_terms
+        return np.concatenate([self.curvature, self.panel_terms], axis=-1)
 
     @cached_property
     def panel_terms(self) -> FloatArray:
@@ -299,7 +392,8 @@ class FitProblem:
         hess, grad; arguments as there."""
         x = np.asarray(x, dtype=np.float64)
         params, beads = self.spread(x)
-        size = len(x)
+        table = self._columns_of_kernel
+        size = len(x) if table is None else len(table)
         written = (
             np.zeros((*use.shape, 2)),
             np.zeros(use.shape),
@@ -307,9 +401,13 @@ class FitProblem:
             np.zeros((size, size)),
             np.zeros(size),
         )
-        panel = np.array(x[self.layout.panel_column :])
-        cost = kernels.evaluate(self.data, params, beads, panel, use, huber, want, *written)
-        return float(cost), *written
+        shifts = np.array(x[self.layout.shift_column :])
+        cost = kernels.evaluate(self.data, params, beads, shifts, use, huber, want, *written)
+        if table is None or want == 0:
+            return float(cost), *written
+        predicted, norms, jac, hess, grad = written
+        whole = hess + np.triu(hess, 1).T
+        return float(cost), predicted, norms, jac @ table, table.T @ whole @ table, grad @ table
 
     @property
     def pixels(self) -> FloatArray:
@@ -347,6 +445,8 @@ def build_problem(
     priors: Mapping[str, float] | None = None,
     prior_centre: Offsets | None = None,
     panel: PanelModel | None = None,
+    strain: Strain = UNSTRAINED,
+    arc: bool = False,
 ) -> FitProblem:
     """Check the arguments of a fit and put them into arrays; see `fit_geometry` for each.
 
@@ -375,12 +475,15 @@ def build_problem(
     base = np.array([values_in(from_printed_reading(p, reading)) for p in starts])
     widths = {n: to_internal(n, w) for n, w in (priors or {}).items() if w > 0}
     terms, of_terms = ((), ()) if panel is None else (panel.names, panel.sigmas)
-    columns = layout(free, count, per_group, k, free_beads, tuple(widths), terms)
+    columns = layout(
+        free, count, per_group, k, free_beads, tuple(widths), terms, max(strain) > 0, arc
+    )
     centres = base[0]
     if prior_centre is not None:
         centres = values_in(from_printed_reading(prior_centre, reading))
     bases = [n.split("@")[0] for n in columns.names[: columns.parameter_count]]
-    beads = columns.panel_column - len(bases)
+    beads = 3 * k if free_beads else 0
+    strains = strain_widths(strain) if max(strain) > 0 else np.zeros(0)
     mean = [centres[NAMES.index(n)] for n in bases]
     sigma = [widths.get(n, math.inf) for n in bases]
     return FitProblem(
@@ -395,10 +498,55 @@ def build_problem(
         reading=reading,
         bias=bias_factors(centre, (n, k)),
         origin=origin,
-        prior_mean=np.concatenate([mean, model.beads.ravel()[:beads], np.zeros(len(terms))]),
-        prior_sigma=np.concatenate([sigma, np.full(beads, bead_tolerance_mm), of_terms]),
+        prior_mean=np.concatenate(
+            [mean, model.beads.ravel()[:beads], np.zeros(len(strains) + arc + len(terms))]
+        ),
+        prior_sigma=np.concatenate(
+            [sigma, np.full(beads, bead_tolerance_mm), strains,
+             np.full(int(arc), ARC_PRIOR), of_terms]
+        ),
         panel=panel,
-    )
+        curvature=curvature(poses, model, base, group, reading) if arc else None,
+    )  # fmt: skip
+
+
+def strain_widths(strain: Strain) -> FloatArray:
+    """Standard deviation of each of STRAINS, (9,)."""
+    stretch, shear = (max(width, LEAST_STRAIN) for width in strain)
+    return np.array([stretch] * STRETCHES + [shear] * (len(STRAINS) - STRETCHES))
+
+
+def curvature(
+    poses: Poses, model: BeadModel, base: FloatArray, group: npt.NDArray[np.int64], reading: Reading
+) -> FloatArray:
+    """Shifts (n, k, 2, 1) [px] of the beads' mean positions if each exposure lasts a whole step.
+
+    A path p of the angle has the mean p + p'' arc^2 / 24 over an arc about it, to the fourth power
+    of the arc: 2e-4 px of 100 px for a step of 15 deg.
+
+    Args:
+        poses: nominal geometry of the n frames.
+        model: the k beads.
+        base: (groups, 17) offsets, internal units, in the reading.
+        group: (n,) of each frame.
+        reading: of eq. 5.4.
+    """
+    out = np.zeros((len(poses), len(model), 2, 1))
+    for g, row in enumerate(base):
+        mine = group == g
+        some = poses[np.flatnonzero(mine)]
+        if len(some) < 2:
+            continue
+        step = float(np.median(np.abs(np.diff(some.angle))))
+        offsets = to_printed_reading(Offsets(*row), reading)
+        turned = (
+            replace(some, angle=some.angle + turn).cone_vec(offsets)
+            for turn in (ARC_ANGLE_RAD, 0.0, -ARC_ANGLE_RAD)
+        )
+        ahead, here, behind = (cone.project_points(model.beads, (1, 1)) for cone in turned)
+        bent = (ahead - 2.0 * here + behind) / ARC_ANGLE_RAD**2
+        out[mine, ..., 0] = bent * step**2 / 24.0
+    return out
 
 
 def frame_shapes(shape: Shape, frames: int) -> FloatArray:

@@ -1,0 +1,168 @@
+"""Causes beside their rivals: columns and evidence against closed forms, and drawn scans."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from causes_named import calibrated, scored
+from faults_drawn import drawn
+
+from flexdt.twin.calibration.bead_model import BeadModel
+from flexdt.twin.calibration.diagnose.tiles import likely_border
+from flexdt.twin.calibration.fit.evidence import Table, averaged
+from flexdt.twin.calibration.fit.fit import estimate_geometry, image_quantities
+from flexdt.twin.calibration.fit.problem import STRAINS, build_problem
+from flexdt.twin.geometry.poses import Poses
+
+BEADS = np.array([[9, 4, -20], [-10, 6, -9], [4, -11, 1], [-3, 10, 12], [11, -2, 21.0]])
+SHAPE = (760, 956)
+SAID = ("phantom_strained", "exposure_arc", "panel_distorted", "bead_tolerance", "causes_open")
+
+
+def upright(frames: int, shift: float = 0.0) -> Poses:
+    angle = 2 * math.pi * (np.arange(frames) + shift) / frames
+    return Poses.upright([0, 0, 0], [0, 600, 0], [0, 1059, 0], 0.1496, angle)
+
+
+def test_a_strained_phantom_is_estimated_with_its_shape() -> None:
+    """Points of beads that are moved by a matrix here; with the distance given, it comes back."""
+    change = np.eye(3) + 2e-3 * np.random.default_rng(2).normal(size=(3, 3))
+    change[1, 0] = change[0, 1]  # else it turns, as alpha does
+    poses = upright(24)
+    tracks = poses.cone_vec().project_points(BEADS @ change.T, SHAPE)
+    fit = estimate_geometry(
+        tracks, BeadModel(BEADS, np.ones(5)), poses, ("dO_x", "alpha", "tau_x", "tau_z"),
+        shape=SHAPE, strain=(1e3, 1e3),
+    )  # fmt: skip
+    strain = dict(
+        zip(STRAINS, fit.solution.x[fit.problem.layout.strain_columns].tolist(), strict=True)
+    )
+    for i, j in np.ndindex(3, 3):
+        term = (
+            "".join("xyz"[k] for k in sorted((i, j))) if {i, j} == {0, 1} else "xyz"[i] + "xyz"[j]
+        )
+        found = strain[term] + (1.0 + strain["scale"] if i == j else 0.0)
+        assert found == pytest.approx(change[i, j], abs=1e-7)
+    assert fit.beads == pytest.approx(BEADS @ change.T, abs=1e-5)
+
+
+@pytest.mark.parametrize("frames", [12, 24, 60])
+def test_the_mean_of_an_arc_is_that_of_its_positions(frames: int) -> None:
+    share = 0.7
+    fine = (np.arange(400) + 0.5) / 400 - 0.5
+    mean = np.mean(
+        [
+            upright(frames, share * part).cone_vec().project_points(BEADS, SHAPE)
+            for part in fine
+        ],
+        axis=0,
+    )  # fmt: skip
+    poses, model = upright(frames), BeadModel(BEADS, np.ones(5))
+    problem = build_problem(mean, model, poses, free=("dO_x",), shape=SHAPE, arc=True)
+    x = problem.start
+    x[problem.layout.arc_column] = share**2
+    assert problem.residuals(x)[0] == pytest.approx(mean, abs=0.3 / frames**2 * 12)
+    assert np.abs(problem.residuals(problem.start)[0] - mean).max() > 20 * 0.3 / frames**2 * 12
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_evidence_differs_as_densities_do(seed: int) -> None:
+    """Of two models with proper priors alone: the normal densities of the values, written out."""
+    rng = np.random.default_rng(seed)
+    rows = rng.normal(size=(60, 7))
+    values = rows[:, :3] @ rng.normal(size=3) + 0.4 * rng.normal(size=60)
+    means = 0.3 * rng.normal(size=7)
+    table = Table(rows, values, 1e-6)
+    models = []
+    for columns in ([0, 1, 2], [0, 1, 2, 3, 4, 5, 6]):
+        widths = np.linspace(0.5, 1.5, len(columns))
+        judged = table.judged(columns, widths, 0.4, means[columns])
+        assert judged is not None
+        part = rows[:, columns]
+        covariance = judged.noise**2 * np.eye(60) + (part * widths**2) @ part.T
+        off = values - part @ means[columns]
+        density = -0.5 * float(
+            np.linalg.slogdet(covariance)[1] + off @ np.linalg.solve(covariance, off)
+        )
+        inverse = np.linalg.inv(part.T @ part / judged.noise**2 + np.diag(1 / widths**2))
+        mean = means[columns] + inverse @ (part.T @ off) / judged.noise**2
+        assert judged.mean == pytest.approx(mean, abs=1e-9)
+        assert judged.covariance(2) == pytest.approx(inverse[:2, :2], rel=1e-9)
+        models.append((judged, density))
+    (one, first), (two, second) = models
+    assert one.evidence - two.evidence == pytest.approx(first - second, abs=1e-6)
+    middle, spread = averaged([one, two], np.array([0.75, 0.25]), 2, one)
+    off = two.mean[:2] - one.mean[:2]
+    assert middle == pytest.approx(0.25 * off)
+    both = 0.75 * one.covariance(2) + 0.25 * (two.covariance(2) + np.outer(off, off))
+    assert spread == pytest.approx(both)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_tile_has_a_least_width(axis: int) -> None:
+    """A shift beyond a border is found there, but not so near the edge that no tile is there."""
+    rng = np.random.default_rng(axis)
+    places = rng.uniform([0, 0], [956, 760], size=(400, 2))
+    whiten = np.tile([50.0, 0.0, 50.0], (400, 1))
+    rows = np.tile(np.eye(2), (400, 1))
+    side = (956, 760)[axis]
+    for share, seen in ((0.4, True), (0.02, False)):
+        shift = np.where(places[:, axis] > share * side, 0.5, 0.0)
+        values = np.stack([shift, np.zeros(400)], axis=1)[:, :: 1 - 2 * axis]
+        noisy = (50.0 * values + rng.normal(size=(400, 2))).ravel()
+        wide = np.full(2, np.inf)
+        found = likely_border(rows, noisy, wide, 1.0, places, whiten, SHAPE, ())
+        assert (found is not None and abs(found.at - share * side) < 8) == seen
+        if found is not None:
+            assert found.axis == axis
+            assert 95 <= found.at <= side - 95
+
+
+@pytest.mark.parametrize(
+    ("kind", "seed"),
+    [
+        ("strain_z", 1), ("strain_x", 2), ("exposed_long", 2), ("as_assumed", 3),
+        ("frame_doubled", 4), ("frame_lost", 5), ("exposed_again", 6),
+    ],
+)  # fmt: skip
+def test_a_drawn_cause_is_named_and_what_is_offered_holds(kind: str, seed: int) -> None:
+    found = scored(kind, seed)
+    assert found.verdict == "right", found
+    assert not found.wrong, found
+
+
+@pytest.mark.slow
+@pytest.mark.campaign(4)
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize(
+    "kind",
+    ["strain_x", "strain_y", "strain_z", "strain_shear", "strain_lean", "exposed_long",
+     "frame_doubled", "frame_lost", "exposed_again", "four_tiles", "grows", "source_jumps"],
+)  # fmt: skip
+def test_no_drawn_cause_is_offered_wrong(kind: str, seed: int) -> None:
+    assert not scored(kind, 500 + seed).wrong
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_exact_phantom_has_no_cause(seed: int) -> None:
+    found = scored("nothing", seed)
+    assert found.offered
+    assert not [line for line in found.said if line.startswith(SAID)]
+
+
+def test_a_strain_takes_part_in_every_sigma() -> None:
+    """Of magnification and distance, as scale and distance look alike."""
+    scan = drawn("nothing", 7)
+    fit = calibrated(scan).fit
+    assert fit is not None
+    exact = replace(
+        scan.believed, priors={n: 0.0 for n in fit.values if n not in scan.believed.free}
+    )
+    known = calibrated(replace(scan, believed=exact)).fit
+    assert known is not None
+    wide, narrow = (image_quantities(f)[0]["magnification"].sigma for f in (fit, known))
+    assert 0.8e-3 < wide / image_quantities(fit)[0]["magnification"].value < 1.3e-3
+    assert narrow < 0.1 * wide

@@ -1,0 +1,478 @@
+"""Which causes the residuals have: one table of causes, judged by their evidence.
+
+A cause is a group of columns beside those of the geometry, with a prior of unknown width: the
+phantom is strained, the object turns while it is exposed, beads are elsewhere, the panel distorts,
+a tile begins, something moves, priors are too narrow. Every combination that is tried has its
+evidence (`fit.evidence`). The most likely is fitted; what all of them say is averaged, so that what
+the data leave open stays in the sigmas; a cause is named where its odds exceed NAMED.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+
+from flexdt.twin.calibration.diagnose.tiles import GAP_WIDTHS_PX, likely_border
+from flexdt.twin.calibration.fit.certificate import widened
+from flexdt.twin.calibration.fit.evidence import Judged, Table, averaged
+from flexdt.twin.calibration.fit.fit import RAYLEIGH_MEDIAN, FitResult
+from flexdt.twin.calibration.fit.fitted_motion import derivative
+from flexdt.twin.calibration.fit.problem import (
+    ARC_PRIOR,
+    STRAINS,
+    STRETCHES,
+    ColumnLayout,
+    FitProblem,
+    Strain,
+    curvature,
+    edge_factor,
+)
+from flexdt.twin.calibration.fit.residual_structure import MOVING
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.panel import Border, PanelModel
+
+NAMED: Final = math.log(1e4)
+"""Logarithm of the odds from which a cause is named."""
+CHANCE: Final = math.log(0.1)
+"""Logarithm of the probability that a scan has a cause, before it is seen; assumed."""
+OUTLIER: Final = 5.0
+"""Residuals beyond so many robust standard deviations count as so many."""
+STRAIN_WIDTHS: Final = (1e-3, 2.5e-3, 6e-3, 1.5e-2, 4e-2)
+BEAD_SHARES: Final = tuple(2e-4 * 2.0**k for k in range(8))
+"""Widths of the beads' places as parts of the phantom's size."""
+PANEL_WIDTHS_PX: Final = tuple(0.004 * 2.5**k for k in range(9))
+MOTION_WIDTHS: Final = (1.0, 4.0, 16.0, 64.0)
+"""Of a motion, in standard deviations of what a whole scan tells of it."""
+WAVES: Final = 8
+"""Shapes that a motion may have here: a ramp, and half waves in a scan."""
+PRIOR_FACTORS: Final = (3.0, 10.0)
+LEAST_MOVING: Final = 12
+"""Frames of a scan from which motion is told from noise."""
+MOST_ROUNDS: Final = 4
+MOST_BORDERS: Final = 2
+WEIGHED: Final = 12.0
+"""Models whose logarithmic evidence is lower by more have no weight."""
+NO_PANEL_PX: Final = 1e-4
+"""Width of the polynomials beside a tile's border where there is no other distortion."""
+SHAPES: Final = ("stretch", "shear")
+"""The causes of a phantom of another shape."""
+MOTION_OF: Final = "motion of "
+MOTIONS: Final = frozenset(MOTION_OF + name for name in MOVING)
+EXPLAINED: Final = 0.5
+"""Part of the residuals that other causes may leave where something seems to move, too."""
+RIVALS: Final = (MOTION_OF, "priors")
+"""Causes that only compete: they are followed elsewhere."""
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A cause that a scan may have.
+
+    Attributes:
+        name: of it.
+        columns: of the table that it adds; none for the widths of the priors.
+        widths: of its columns that are tried.
+        chance: logarithm of its probability before the scan is seen.
+        always: width that it has where it is not chosen; 0: its columns are left out.
+    """
+
+    name: str
+    columns: tuple[int, ...]
+    widths: tuple[float, ...]
+    chance: float = CHANCE
+    always: float = 0.0
+
+
+Choice = tuple[float, ...]
+"""Width of each cause of a table; 0: not chosen."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """The causes of a fit.
+
+    Attributes:
+        odds: logarithm of the odds of each cause, by name; borders by their place.
+        applied: names of causes that are columns of the fit.
+        open: names of causes that the data neither show nor exclude.
+        strain: of the phantom, averaged: (9,) and its covariance (9, 9); None: it is not judged.
+    """
+
+    odds: dict[str, float] = field(default_factory=dict)
+    applied: tuple[str, ...] = ()
+    open: tuple[str, ...] = ()
+    strain: tuple[FloatArray, FloatArray] | None = None
+
+    def named(self, name: str) -> bool:
+        """Whether a cause of the fit is beyond doubt."""
+        return name in self.applied and self.odds.get(name, -math.inf) > NAMED
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What is said of the phantom and the positions.
+
+    Attributes:
+        strain: priors of the phantom's stretches and shears, 0: it has its stated shape.
+        bead_tolerance_mm: of the request; None: unknown, 0: beads are where the phantom says.
+        floor: least standard deviation of whitened residuals.
+    """
+
+    strain: Strain
+    bead_tolerance_mm: float | None
+    floor: float
+
+
+Refit = Callable[..., FitResult]
+"""Fit again with something else free: options of `fits_of_scans.refit_scans`."""
+
+
+class Candidates:
+    """The table of a fit: its geometry's columns, and those of every cause."""
+
+    def __init__(self, fit: FitResult, known: Known, borders: Sequence[Border]) -> None:
+        problem, x = fit.problem, fit.solution.x
+        self.fit, self.known, self.borders = fit, known, tuple(borders)
+        self.count = problem.layout.parameter_count
+        everything, there = _with_every_column(problem, x, panel_of(fit, borders))
+        rows = everything.jacobian(there, problem.seen)[np.repeat(problem.seen.ravel(), 2)]
+        left = problem.whitened(x)[problem.seen]
+        lengths = np.linalg.norm(left, axis=1)
+        self.noise = max(float(np.median(lengths)) / RAYLEIGH_MEDIAN, known.floor)
+        bounded = np.minimum(1.0, OUTLIER * self.noise / np.maximum(lengths, 1e-12))
+        share = np.repeat(bounded, 2)[:, None]
+        motion = [rows_of for name in self._moving() for rows_of in self._motion(name)]
+        table = np.concatenate([rows, *motion], axis=1) * share
+        causes = there - everything.start
+        causes[: self.count] = 0.0
+        values = left.ravel() + rows @ causes
+        self.rows, self.values = table, values * share[:, 0]
+        self.table = Table(self.rows, self.values, known.floor)
+        self.causes = self._causes(everything)
+        self._judged: dict[Choice, Judged | None] = {}
+        self.means = np.zeros(table.shape[1])
+        self.means[: self.count] = (problem.prior_mean - x)[: self.count]
+
+    def _moving(self) -> list[str]:
+        sizes = np.bincount(self.fit.problem.group)
+        if len(sizes) != 1 or sizes[0] < LEAST_MOVING:
+            return []
+        return [n for n in MOVING if n in self.fit.values]
+
+    def _motion(self, name: str) -> Iterator[FloatArray]:
+        """Columns of unit length of a parameter that follows a ramp or half waves."""
+        problem = self.fit.problem
+        n, k = problem.seen.shape
+        slope = derivative(problem, self.fit, name, problem.seen).reshape(n, 2 * k)
+        place = (np.arange(n) + 0.5) / n
+        seen = np.repeat(problem.seen.ravel(), 2)
+        shapes = [place - 0.5, *(np.cos(math.pi * wave * place) for wave in range(1, WAVES))]
+        for shape in shapes:
+            column = (slope * shape[:, None]).ravel()[seen]
+            yield (column / max(float(np.linalg.norm(column)), 1e-300))[:, None]
+
+    def _causes(self, everything: FitProblem) -> tuple[Cause, ...]:
+        layout, known = everything.layout, self.known
+        out = []
+        exact = known.bead_tolerance_mm == 0
+        if not exact:
+            first, last = layout.strain_columns.start, layout.strain_columns.stop
+            parts = range(first, first + STRETCHES), range(first + STRETCHES, last)
+            for name, part, said in zip(SHAPES, parts, known.strain, strict=True):
+                widths = tuple(w for w in STRAIN_WIDTHS if w > 1.5 * said)
+                out.append(Cause(name, tuple(part), widths, always=said))
+            k = len(everything.model)
+            if 3 * k - 7 >= 2:  # less a rigid motion and a scale
+                size = float(np.ptp(everything.model.beads, axis=0).max())
+                said = known.bead_tolerance_mm or 0.0
+                widths = tuple(w for s in BEAD_SHARES if (w := s * size) > 1.5 * said)
+                columns = tuple(range(layout.bead_columns.start, layout.bead_columns.stop))
+                out.append(Cause("beads", columns, widths, always=said))
+        out.append(Cause("arc", (layout.arc_column,), (ARC_PRIOR,)))
+        panel = everything.panel
+        if panel is not None:
+            first = layout.panel_column
+            bent = len(panel.names) - 2 * len(panel.borders)
+            columns = tuple(range(first, first + bent))
+            out.append(Cause("panel", columns, PANEL_WIDTHS_PX))
+            for i, border in enumerate(panel.borders):
+                at = first + bent + 2 * i
+                chance = CHANCE - math.log(sum(panel.shape))
+                out.append(Cause(border_name(border), (at, at + 1), GAP_WIDTHS_PX, chance))
+        first = len(layout.names)
+        for name in self._moving():
+            columns = tuple(range(first, first + WAVES))
+            widths = tuple(w * self.noise for w in MOTION_WIDTHS)
+            out.append(Cause(MOTION_OF + name, columns, widths))
+            first += WAVES
+        out.append(Cause("priors", (), PRIOR_FACTORS))
+        return tuple(out)
+
+    def judged(self, choice: Choice) -> Judged | None:
+        """Judge a choice; None where its columns cannot be told apart."""
+        if choice not in self._judged:
+            factor = choice[-1] or 1.0
+            columns = list(range(self.count))
+            widths = [self.fit.problem.prior_sigma[: self.count] * factor]
+            chance = 0.0
+            for cause, pick in zip(self.causes, choice, strict=True):
+                width = pick or cause.always
+                if cause.columns and width > 0:
+                    columns += cause.columns
+                    widths.append(np.full(len(cause.columns), width))
+                if pick:
+                    chance += cause.chance - math.log(len(cause.widths))
+            model = self.table.judged(
+                columns, np.concatenate(widths), self.noise, self.means[columns]
+            )
+            if model is not None:
+                model = replace(model, evidence=model.evidence + chance)
+            self._judged[choice] = model
+        return self._judged[choice]
+
+    def evidence(self, choice: Choice) -> float:
+        """The logarithm of a choice's probability, but for a constant."""
+        model = self.judged(choice)
+        return -math.inf if model is None else model.evidence
+
+    def best(self) -> Choice:
+        """The most likely choice, by changing one cause at a time from several starts."""
+        nothing: Choice = (0.0,) * len(self.causes)
+        singles = [
+            with_pick(nothing, i, width)
+            for i, cause in enumerate(self.causes)
+            for width in cause.widths
+        ]
+        ranked = sorted(singles, key=self.evidence, reverse=True)
+        tops: dict[int, Choice] = {}
+        for single in ranked:
+            tops.setdefault(int(np.flatnonzero(single)[0]), single)
+        likely = [
+            s for s in tops.values() if self.evidence(s) > self.evidence(nothing) - math.log(10.0)
+        ]
+        starts = [nothing, *likely[:3]] if likely else [nothing]
+        if not likely:
+            return nothing
+        return max((self._climbed(start) for start in starts), key=self.evidence)
+
+    def _climbed(self, choice: Choice) -> Choice:
+        while True:
+            before = choice
+            for i, cause in enumerate(self.causes):
+                picks = [with_pick(choice, i, w) for w in (0.0, *cause.widths)]
+                choice = max(picks, key=self.evidence)
+            if choice == before:
+                return choice
+
+    def odds(self) -> dict[str, float]:
+        """Logarithm of the odds of each cause, from all choices judged."""
+        out = {}
+        for i, cause in enumerate(self.causes):
+            sides: list[list[float]] = [[], []]
+            for choice, model in self._judged.items():
+                if model is not None:
+                    sides[bool(choice[i])].append(model.evidence)
+            out[cause.name] = _total(sides[1]) - _total(sides[0])
+        return out
+
+    def left_open(self, choice: Choice, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Mean of the first columns over all choices, and covariance about a choice; and the
+        covariance of the choice itself.
+
+        Choices with wider priors are left out: what is said of the scanner is believed where the
+        images do not contradict it.
+        """
+        at = self.judged(choice)
+        assert at is not None
+        some = [
+            m
+            for c, m in self._judged.items()
+            if m is not None and c[-1] == choice[-1] and m.evidence > at.evidence - WEIGHED
+        ]
+        weights = np.exp(np.array([m.evidence for m in some]) - at.evidence)
+        middle, spread = averaged(some, weights / weights.sum(), count, at)
+        return at.mean[:count] + middle, spread, at.covariance(count)
+
+    def strain(self, choice: Choice) -> tuple[FloatArray, FloatArray] | None:
+        """The phantom's strain (9,) averaged over all choices, and its covariance; None where it
+        has none in some."""
+        if not min(self.known.strain) > 0:
+            return None
+        last = self.count + len(STRAINS)
+        at = self.judged(choice)
+        assert at is not None
+        middle, spread, _ = self.left_open(choice, last)
+        off = middle - at.mean[:last]
+        own = slice(self.count, last)
+        return middle[own], (spread - np.outer(off, off))[own, own]
+
+    def width(self, choice: Choice, name: str) -> float:
+        """Width of a cause in a choice; 0: it is not chosen, or not in the table."""
+        for cause, pick in zip(self.causes, choice, strict=True):
+            if cause.name == name:
+                return pick
+        return 0.0
+
+    def border(self, choice: Choice) -> Border | None:
+        """A tile's border that a choice's residuals ask for."""
+        model = self.judged(choice)
+        shape = image_shape(self.fit)
+        if model is None or shape is None:
+            return None
+        problem = self.fit.problem
+        predicted = problem.residuals(self.fit.solution.x)[0][problem.seen]
+        widths = np.concatenate(
+            [np.full(self.count, np.inf)]
+            + [np.full(len(c.columns), w) for c, p in zip(self.causes, choice, strict=True)
+               if c.columns and (w := p or c.always) > 0]
+        )  # fmt: skip
+        widths[: self.count] = problem.prior_sigma[: self.count]
+        return likely_border(
+            self.rows[:, model.columns], self.values, widths, model.noise,
+            predicted, problem.whiten[problem.seen], shape, self.borders,
+        )  # fmt: skip
+
+
+def explained_by_causes(fit: FitResult, known: Known, refit: Refit) -> tuple[FitResult, Found]:
+    """The fit with the most likely causes as columns, sigmas averaged over those left open.
+
+    Args:
+        fit: of the geometry, the phantom's strain with its prior.
+        known: what is said of the phantom and the positions.
+        refit: fits again with `strain`, `arc`, `bead_tolerance_mm` and `panel`.
+    """
+    first = fit
+    borders: tuple[Border, ...] = ()
+    applied: tuple[object, ...] = ()
+    for _ in range(MOST_ROUNDS):
+        candidates = Candidates(fit, known, borders)
+        choice = candidates.best()
+        while len(borders) < MOST_BORDERS:
+            more = candidates.border(choice)
+            if more is None:
+                break
+            wider = Candidates(fit, known, (*borders, more))
+            chosen = wider.best()
+            if not wider.width(chosen, border_name(more)):
+                break
+            borders, candidates, choice = wider.borders, wider, chosen
+        borders = tuple(b for b in borders if candidates.width(choice, border_name(b)))
+        options = _options(candidates, choice, borders)
+        if tuple(options.values()) == applied or not (applied or any(options.values())):
+            break
+        applied = tuple(options.values())
+        better = refit(**options)
+        if not better.identifiable:
+            return first, Found()
+        fit = better
+    odds = candidates.odds()
+    moves = any(p for c, p in zip(candidates.causes, choice, strict=True) if c.name in MOTIONS)
+    # What moves looks like other causes in part, and most of it stays in the residuals.
+    if moves and fit.certificate.rms_px > EXPLAINED * first.certificate.rms_px:
+        return first, Found(odds)
+    names = tuple(
+        c.name for c, pick in zip(candidates.causes, choice, strict=True)
+        if pick and not c.name.startswith(RIVALS)
+    )  # fmt: skip
+    doubtful = tuple(n for n, o in odds.items() if abs(o) < NAMED and not n.startswith(RIVALS))
+    found = Found(odds, names, doubtful, candidates.strain(choice))
+    return _widened(fit, candidates, choice), found
+
+
+def _widened(fit: FitResult, candidates: Candidates, choice: Choice) -> FitResult:
+    """The fit with what the choices differ by in its covariance."""
+    _, spread, own = candidates.left_open(choice, candidates.count)
+    factor = [edge_factor(n) for n in fit.problem.layout.names[: candidates.count]]
+    more = (spread - own) * np.outer(factor, factor)
+    values, vectors = np.linalg.eigh(more)
+    if not (values > 0).any():
+        return fit
+    more = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    return replace(fit, certificate=widened(fit.certificate, more))
+
+
+def _options(
+    candidates: Candidates, choice: Choice, borders: Sequence[Border]
+) -> dict[str, object]:
+    """What the refit is asked for; falsy where nothing is."""
+    said = candidates.known.strain
+    strain = tuple(candidates.width(choice, n) or w for n, w in zip(SHAPES, said, strict=True))
+    beads = candidates.width(choice, "beads")
+    bent = candidates.width(choice, "panel")
+    shape = image_shape(candidates.fit)
+    panel = None
+    if shape is not None and (bent or borders):
+        panel = PanelModel(bent or NO_PANEL_PX, shape, tuple(borders))
+    return {
+        "strain": None if strain == said else strain,
+        "arc": bool(candidates.width(choice, "arc")),
+        "bead_tolerance_mm": beads or None,
+        "panel": panel,
+    }
+
+
+def image_shape(fit: FitResult) -> tuple[int, int] | None:
+    """(rows, cols) of the images; None where they differ."""
+    sizes = np.unique(2 * fit.problem.origin + 1, axis=0)
+    return (int(sizes[0, 1]), int(sizes[0, 0])) if len(sizes) == 1 else None
+
+
+def panel_of(fit: FitResult, borders: Sequence[Border]) -> PanelModel | None:
+    """Every term that a panel's distortion may have."""
+    shape = image_shape(fit)
+    return None if shape is None else PanelModel(1.0, shape, tuple(borders))
+
+
+def border_name(border: Border) -> str:
+    """Name the cause that a tile begins at a border."""
+    return f"tile from {('column', 'row')[border.axis]} {border.at:.0f}"
+
+
+def with_pick(choice: Choice, i: int, pick: float) -> Choice:
+    """A choice with another width of one cause."""
+    return (*choice[:i], pick, *choice[i + 1 :])
+
+
+def _total(evidence: Sequence[float]) -> float:
+    """Logarithm of the sum of probabilities."""
+    if not evidence:
+        return -math.inf
+    top = max(evidence)
+    return top + math.log(sum(math.exp(e - top) for e in evidence))
+
+
+def _with_every_column(
+    problem: FitProblem, x: FloatArray, panel: PanelModel | None
+) -> tuple[FitProblem, FloatArray]:
+    """The problem with a column for every cause, and the columns' values where a fit has them."""
+    old = problem.layout
+    count, k = old.parameter_count, len(problem.model)
+    terms = () if panel is None else panel.names
+    names = [
+        *old.names[:count],
+        *(f"bead {b} {axis}" for b in range(k) for axis in "xyz"),
+        *(f"strain {term}" for term in STRAINS),
+        "arc",
+        *(f"panel {term}" for term in terms),
+    ]
+    strain = count + 3 * k
+    arc = strain + len(STRAINS)
+    layout = ColumnLayout(
+        tuple(names), old.asked, old.colmap, count, strain, arc, count, arc + 1, old.active,
+        old.held,
+    )  # fmt: skip
+    base = problem.spread(x)[0]
+    whole = replace(
+        problem, layout=layout, panel=panel, base=base,
+        curvature=curvature(problem.poses, problem.model, base, problem.group, problem.reading),
+    )  # fmt: skip
+    there = whole.start
+    places = {name: i for i, name in enumerate(names)}
+    for name, value in zip(old.names, x.tolist(), strict=True):
+        if name in places:
+            there[places[name]] = value
+    return whole, there

@@ -1,0 +1,171 @@
+"""Which angle each frame really shows: lost, doubled and exposed-again frames.
+
+The number of the angle that a frame shows, less its own number, is hidden and mostly stays from
+frame to frame. The most likely sequence (Viterbi, IEEE Trans. Inf. Theory 13 (1967) 260) is found
+from how far each frame's spots lie from where the beads appear at neighbouring angles.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.calibration.detect.detection import Detections
+from flexdt.twin.calibration.diagnose import Finding, error, warning
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.geometry.poses import Poses
+
+MOST_SHIFT: Final = 6
+"""Numbers by which a frame may be off."""
+CHANGE: Final = math.log(1e3)
+"""Cost of another shift than the frame's before; assumed: one frame in a thousand."""
+ASTRAY: Final = math.log(1e3)
+"""Cost of a spot that is none of the beads."""
+GOOD_SHARE: Final = 0.8
+"""Part of the frames that must show the phantom at the angles found."""
+LEAST_SPREAD_PX: Final = 0.05
+SHOWN: Final = 6
+"""Changes that are listed."""
+
+
+@dataclass(frozen=True, eq=False)
+class FrameNumbers:
+    """What the frames of a scan show.
+
+    Attributes:
+        shift: (n,) number of the angle that a frame shows, less its own, 0 in the first frame.
+        fits: (n,) frames that show the phantom at that angle.
+    """
+
+    shift: npt.NDArray[np.int64]
+    fits: npt.NDArray[np.bool_]
+
+    @property
+    def again(self) -> npt.NDArray[np.intp]:
+        """Frames that show another angle, while the frames after them show their own."""
+        return np.flatnonzero((self.shift != self._settled) & self.fits)
+
+    @property
+    def renumbered(self) -> bool:
+        """The frames' numbers are wrong from some frame on."""
+        return bool((self._settled != 0).any())
+
+    @property
+    def _settled(self) -> npt.NDArray[np.int64]:
+        """The shift without single frames, of which the last may be one."""
+        out = self.shift.copy()
+        n = len(out)
+        for i in range(1, n):
+            if out[i] != out[i - 1] and (i == n - 1 or self.shift[i + 1] == out[i - 1]):
+                out[i] = out[i - 1]
+        return out
+
+    def judged(self, name: str) -> Finding | None:
+        """Say what is wrong with the numbers of the scan `name`; None: nothing."""
+        if not self.renumbered:
+            again = self.again.tolist()
+            if not again:
+                return None
+            said = "; ".join(
+                f"frame {i} shows what frame {i + int(self.shift[i])} should" for i in again[:SHOWN]
+            )
+            return warning(
+                "frames_inconsistent",
+                f"{name}: in {len(again)} of {len(self.shift)} frames the shadows are not where "
+                f"the others put them: {said}; those frames are not used",
+            )
+        settled = self._settled
+        changes = np.flatnonzero(np.diff(settled)) + 1
+        said = "; ".join(
+            _change(int(i), int(settled[i] - settled[i - 1])) for i in changes[:SHOWN].tolist()
+        )
+        more = "" if len(changes) <= SHOWN else f" (and {len(changes) - SHOWN} more)"
+        return error(
+            "frame_numbers",
+            f"{name}: {said}{more}: the frames' angles are those of other frames; number them "
+            "anew, or scan again",
+        )
+
+
+def _change(frame: int, steps: int) -> str:
+    if steps < 0:
+        times = "" if steps == -1 else f" {-steps} times"
+        return (
+            f"frame {frame} shows the angle of frame {frame - 1} again, and all after it come "
+            f"late: doubled{times}"
+        )
+    lost = "a frame is" if steps == 1 else f"{steps} frames are"
+    return f"{lost} lost between frames {frame - 1} and {frame}"
+
+
+def frame_numbers(
+    detections: Sequence[Detections],
+    beads: FloatArray,
+    poses: Poses,
+    offsets: Offsets,
+    spread_px: float,
+) -> FrameNumbers | None:
+    """Find which angle each frame shows; None where the beads do not tell.
+
+    Args:
+        detections: spots of each of the n frames.
+        beads: (k, 3) [mm].
+        poses: nominal geometry.
+        offsets: geometry that most frames agree with.
+        spread_px: by which spots lie from where the beads appear.
+    """
+    n = len(poses)
+    shifts = np.arange(-MOST_SHIFT, MOST_SHIFT + 1)
+    if n < 2 * MOST_SHIFT:
+        return None
+    spread = max(spread_px, LEAST_SPREAD_PX)
+    there = np.array([len(d) >= 2 for d in detections])
+    costs = np.zeros((n, len(shifts)))
+    near = np.zeros((n, len(shifts)))
+    for column, step in enumerate(shifts.tolist()):
+        turned = replace(poses, angle=_angles(poses.angle, step))
+        places = turned.cone_vec(offsets).project_points(beads, detections[0].shape)
+        for i in np.flatnonzero(there).tolist():
+            gap = np.linalg.norm(detections[i].centers[:, None] - places[i][None], axis=2)
+            square = (gap.min(axis=1) / spread) ** 2
+            costs[i, column] = float(np.minimum(0.5 * square, ASTRAY).sum())
+            near[i, column] = float(np.mean(0.5 * square < ASTRAY))
+    path = _likeliest(costs)
+    fits = near[np.arange(n), path] > 0.5
+    if fits[there].mean() < GOOD_SHARE:
+        return None
+    found = np.asarray(shifts[path], dtype=np.int64)
+    return FrameNumbers(found - found[0], fits & there)
+
+
+def _angles(angle: FloatArray, shift: int) -> FloatArray:
+    """Angles of frames `shift` numbers further on; beyond the ends, the steps go on."""
+    n = len(angle)
+    first, last = angle[1] - angle[0], angle[-1] - angle[-2]
+    beyond = np.arange(1, MOST_SHIFT + 1)
+    whole = np.concatenate([angle[0] - first * beyond[::-1], angle, angle[-1] + last * beyond])
+    return np.asarray(whole[MOST_SHIFT + shift : MOST_SHIFT + shift + n])
+
+
+def _likeliest(costs: FloatArray) -> npt.NDArray[np.intp]:
+    """The path (n,) of least cost through (n, states), changes included."""
+    n, states = costs.shape
+    total = costs[0].copy()
+    came = np.zeros((n, states), dtype=np.intp)
+    own = np.arange(states)
+    for i in range(1, n):
+        best = int(np.argmin(total))
+        moved = total[best] + CHANGE < total
+        came[i] = np.where(moved, best, own)
+        total = np.where(moved, total[best] + CHANGE, total) + costs[i]
+    path = np.empty(n, dtype=np.intp)
+    path[-1] = int(np.argmin(total))
+    for i in range(n - 1, 0, -1):
+        path[i - 1] = came[i, path[i]]
+    return path

@@ -1,0 +1,141 @@
+"""What is said of the causes that were found in the residuals."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from flexdt.twin.calibration.diagnose import Finding, listed, warning
+from flexdt.twin.calibration.diagnose.causes import SHAPES, Found, border_name
+from flexdt.twin.calibration.fit.fit import FitResult
+from flexdt.twin.calibration.fit.problem import STRAINS
+from flexdt.twin.calibration.fit.residual_structure import SIGNIFICANT
+from flexdt.twin.geometry.conventions import FloatArray
+
+SPOKEN: Final = {
+    "stretch": "a phantom of another shape",
+    "shear": "a phantom of another shape",
+    "beads": "beads elsewhere",
+    "arc": "a stage that turns while a frame is exposed",
+    "panel": "a panel that distorts",
+}
+"""Causes that may be left open, in words."""
+ALIKE: Final = ("arc", "beads", "panel")
+"""Causes that may look like a phantom of another shape."""
+TERMS: Final[dict[str, dict[str, float]]] = {
+    "taller": {"zz": 1.0, "xx": -0.5, "yy": -0.5},
+    "longer along x than along y": {"xx": 1.0, "yy": -1.0},
+    "sheared across": {"xy": 2.0},
+    "aslant along x": {"xz": 1.0},
+    "tilted along x": {"zx": 1.0},
+    "aslant along y": {"yz": 1.0},
+    "tilted along y": {"zy": 1.0},
+}
+"""What is said of a strain, and how it follows from STRAINS."""
+PARTS: Final[dict[str, FloatArray]] = {
+    name: np.array([terms.get(term, 0.0) for term in STRAINS]) for name, terms in TERMS.items()
+}
+
+
+def named_causes(fit: FitResult, plain: FitResult, found: Found) -> list[Finding]:
+    """Findings of the causes of a fit.
+
+    Args:
+        fit: with the causes as columns.
+        plain: without them.
+        found: which there are, and their odds.
+    """
+    out: list[Finding] = []
+    panel = fit.panel
+    borders = () if panel is None else panel.model.borders
+    strained = _strained(found)
+    out += listed(strained)
+    if found.named("arc"):
+        out.append(_turning(fit))
+    if found.named("beads"):
+        out.append(_elsewhere(fit))
+    if found.named("panel") or any(found.named(border_name(b)) for b in borders):
+        out.append(_distorted(fit))
+    doubtful = [n for n in found.applied if not found.named(n)]
+    if strained is not None:  # It is said which rivals it has.
+        doubtful = [n for n in doubtful if n not in SHAPES and n not in ALIKE]
+    if doubtful:
+        rivals = dict.fromkeys(SPOKEN.get(n, f"a {n}") for n in [*doubtful, *found.open])
+        said = " or ".join(rivals)
+        out.append(
+            warning(
+                "causes_open",
+                f"the residuals have a cause that the images do not tell for certain: {said}; "
+                "the intervals contain what they differ by",
+            )
+        )
+    return out
+
+
+def _strained(found: Found) -> Finding | None:
+    """By how much the phantom is strained beside its scale, which images do not tell."""
+    if found.strain is None:
+        return None
+    mean, covariance = found.strain
+    parts = [
+        (float(row @ mean), float(row @ mean) / max(float(np.sqrt(row @ covariance @ row)), 1e-12))
+        for row in PARTS.values()
+    ]
+    certain = {
+        n: value for n, (value, score) in zip(PARTS, parts, strict=True)
+        if abs(score) > SIGNIFICANT
+    }  # fmt: skip
+    if not certain:
+        return None
+    most = max(map(abs, certain.values()))
+    said = ", ".join(f"{100 * v:+.2g} % {n}" for n, v in certain.items() if abs(v) > 0.3 * most)
+    alike = [SPOKEN[n] for n in ALIKE if n in found.open or n in found.applied]
+    rival = f" (or there is {' or '.join(alike)}, which looks alike)" if alike else ""
+    return warning(
+        "phantom_strained",
+        f"the phantom is not as its file says: {said}{rival}. Its shape was fitted along; how "
+        "large it is as a whole images do not tell, so lengths, dO_z and the magnification hold "
+        "as far as its millimetre: measure it, or give --bead-tolerance",
+    )
+
+
+def _turning(fit: FitResult) -> Finding:
+    """How long the exposures last."""
+    layout = fit.problem.layout
+    share = float(np.sqrt(max(fit.solution.x[layout.arc_column], 0.0)))
+    step = np.degrees(np.median(np.abs(np.diff(fit.problem.poses.angle))))
+    return warning(
+        "exposure_arc",
+        f"the object turns while a frame is exposed, by {share * step:.2g} deg, {share:.2f} of a "
+        "step: the mean of the arc was fitted; volumes are blurred along the turn, and angles are "
+        "those of the middle of each exposure",
+    )
+
+
+def _elsewhere(fit: FitResult) -> Finding:
+    """How far beads are from the phantom's model."""
+    moved = np.linalg.norm(fit.beads - fit.problem.model.beads, axis=1)
+    return warning(
+        "bead_tolerance",
+        f"the beads lie {1000 * float(moved.max()):.0f} um off their model at most; their "
+        f"positions were fitted too (prior {1000 * fit.bead_prior_mm:.0f} um): wider intervals",
+    )
+
+
+def _distorted(fit: FitResult) -> Finding:
+    """By how much the panel distorts, and where tiles begin."""
+    panel = fit.panel
+    assert panel is not None
+    rows, cols = panel.model.shape
+    row, column = np.mgrid[0 : rows - 1 : 9j, 0 : cols - 1 : 9j]
+    size = float(np.abs(panel.shift(np.stack([column, row], axis=-1))).max())
+    tiles = "".join(
+        f"; a tile begins at {('column', 'row')[b.axis]} {b.at:.0f}" for b in panel.model.borders
+    )
+    return warning(
+        "panel_distorted",
+        f"the panel distorts its picture by up to {size:.2f} px{tiles}: this was estimated along "
+        "with the geometry, its uncertainty is in every sigma, and reconstruct undoes it with the "
+        "correction",
+    )

@@ -1,0 +1,93 @@
+"""Where a tile of the panel begins: the border through which the residuals are parted best."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.panel import Border
+
+GAP_WIDTHS_PX: Final = (0.1, 0.5, 2.0, 8.0)
+"""Standard deviations of a tile's shift that are tried."""
+LEAST_TILE: Final = 1 / 8
+"""Part of the panel's rows or columns that a tile has at least; assumed."""
+LEAST_SIDE: Final = 4
+"""Positions that a tile shows at least."""
+
+
+def likely_border(
+    rows: FloatArray,
+    values: FloatArray,
+    widths: FloatArray,
+    noise: float,
+    places: FloatArray,
+    whiten: FloatArray,
+    shape: tuple[int, int],
+    known: Sequence[Border],
+) -> Border | None:
+    """The border whose shift explains most of what columns leave; None where it is chance.
+
+    Args:
+        rows: (2 m, c) of the columns.
+        values: (2 m,) to be explained.
+        widths: (c,) of the columns' priors.
+        noise: standard deviation of the values.
+        places: (m, 2) predicted column and row of each position; by measured ones, a border would
+            part the positions of a bead that keeps its row by their noise.
+        whiten: (m, 3) of the positions.
+        shape: (rows, cols) of the image.
+        known: borders that are there already.
+    """
+    m = len(places)
+    weight = np.where(np.isinf(widths), 0.0, noise / widths)
+    size = np.sqrt(np.einsum("mc,mc->c", rows, rows) + weight**2)
+    size = np.where(size > 0, size, 1.0)
+    table = np.concatenate([rows / size, np.diag(weight / size)])
+    basis = np.linalg.qr(table)[0][: 2 * m]
+    left = values - basis @ (basis.T @ values)
+    # Rows of a shift by a column, and by a row.
+    across = np.stack([whiten[:, 0], np.zeros(m)], axis=1).ravel()
+    down = np.stack([whiten[:, 1], whiten[:, 2]], axis=1).ravel()
+    best, most = None, -math.inf
+    for axis in (0, 1):
+        order = np.argsort(-places[:, axis], kind="stable")
+        both = (2 * order[:, None] + [0, 1]).ravel()
+        push, inside = [], []
+        for shift in (across, down):
+            push.append(np.cumsum((shift * left)[both])[1::2])
+            inside.append(np.cumsum(shift[both, None] * basis[both], axis=0)[1::2])
+        gram = np.empty((m, 2, 2))
+        for i, one in enumerate((across, down)):
+            for j, other in enumerate((across, down)):
+                whole = np.cumsum((one * other)[both])[1::2]
+                gram[:, i, j] = whole - np.einsum("mc,mc->m", inside[i], inside[j])
+        pushed = np.stack(push, axis=1)
+        bend = np.maximum(np.einsum("mii->mi", gram), 1e-12)
+        unit = gram / np.sqrt(bend[:, :, None] * bend[:, None, :]) + 1e-6 * np.eye(2)
+        scaled = pushed / np.sqrt(bend)
+        gain = np.einsum("mi,mi->m", scaled, np.linalg.solve(unit, scaled[..., None])[..., 0])
+        at = places[order, axis]
+        between = np.append(0.5 * (at[:-1] + at[1:]), 0.0)
+        usable = _allowed(between, shape[1 - axis], [b.at for b in known if b.axis == axis])
+        usable[: LEAST_SIDE - 1] = False
+        usable[m - LEAST_SIDE :] = False
+        gain = np.where(usable, gain, -math.inf)
+        top = int(np.argmax(gain))
+        if gain[top] > most:
+            best, most = Border(axis, float(between[top])), float(gain[top])
+    places_tried = math.log(sum(shape))
+    return best if 0.5 * most / noise**2 > places_tried else None
+
+
+def _allowed(at: FloatArray, side: int, known: Sequence[float]) -> npt.NDArray[np.bool_]:
+    """Borders that leave every tile its least width."""
+    least = LEAST_TILE * side
+    out = (at > least) & (at < side - least)
+    for other in known:
+        out &= np.abs(at - other) > least
+    return np.asarray(out)

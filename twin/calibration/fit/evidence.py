@@ -1,0 +1,138 @@
+"""Evidence of linear models of the residuals, and what averaging over them states.
+
+A model gives each column of a table a normal prior; columns of no prior are flat. Its evidence is
+the likelihood of the residuals with all columns integrated out, at the standard deviation of the
+residuals that makes them most likely (MacKay, Neural Computation 4 (1992) 415). Estimates averaged
+with those weights have the covariance of the mixture: what the models say, and how far they differ.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import lapack
+
+from flexdt.twin.calibration.fit.residual_structure import cross
+from flexdt.twin.geometry.conventions import FloatArray
+
+PASSES = 3
+"""Steps of the search for the residuals' standard deviation."""
+LEAST_SHARE = 1e-12
+"""Of the residuals' squares: what is less is rounding."""
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A model with its evidence.
+
+    Attributes:
+        columns: (c,) of the table that it has.
+        mean: (c,) estimates.
+        factor: (c, c) upper Cholesky factor of the scaled precision.
+        scale: (c,) of the columns.
+        noise: standard deviation of the residuals.
+        evidence: logarithm of the likelihood, but for a constant that all models share.
+    """
+
+    columns: npt.NDArray[np.intp]
+    mean: FloatArray
+    factor: FloatArray
+    scale: FloatArray
+    noise: float
+    evidence: float
+
+    def covariance(self, count: int) -> FloatArray:
+        """(count, count) of the first columns."""
+        part = np.eye(len(self.columns))[:, :count] * self.scale[:count]
+        solved, _ = lapack.dpotrs(self.factor, part)
+        return np.asarray(solved[:count] * self.scale[:count, None])
+
+
+class Table:
+    """Rows of residuals and of all columns that a model may have."""
+
+    def __init__(self, rows: FloatArray, values: FloatArray, floor: float) -> None:
+        """From rows (m, q), values (m,), and the least standard deviation of the values."""
+        self._count = len(values)
+        self._gram = cross(rows, rows)
+        self._push = np.einsum("mq,m->q", rows, values)
+        self._total = float(values @ values)
+        self._floor = floor
+
+    def judged(
+        self, columns: Sequence[int], widths: FloatArray, noise: float, means: FloatArray
+    ) -> Judged | None:
+        """Judge a model; None where its columns cannot be told apart.
+
+        Args:
+            columns: that it has.
+            widths: (c,) standard deviations of their priors; inf where there is none.
+            noise: where the search for the standard deviation of the residuals begins.
+            means: (c,) of the priors; any where there is none.
+        """
+        at = np.asarray(columns, dtype=np.intp)
+        gram = self._gram[np.ix_(at, at)]
+        flat = np.isinf(widths)
+        precision = np.where(flat, 0.0, 1.0 / widths**2)
+        # Deviations from the means have priors about zero.
+        there = np.where(flat, 0.0, means)
+        moved = gram @ there
+        push = self._push[at] - moved
+        total = self._total - float(there @ (2.0 * self._push[at] - moved))
+        total = max(total, LEAST_SHARE * self._total)
+        power = np.diag(gram)
+        flats = int(flat.sum())
+        freedom = max(self._count - flats, 1)
+        variance = max(noise, self._floor) ** 2
+        out = None
+        for _ in range(PASSES):
+            inside = power / variance + precision
+            scale = 1.0 / np.sqrt(np.where(inside > 0.0, inside, 1.0))
+            whole = gram / variance
+            whole.flat[:: len(at) + 1] += precision
+            whole *= np.outer(scale, scale)
+            factor, found, failed = lapack.dposv(whole, push * scale / variance)
+            if failed:
+                return None
+            found = found * scale
+            left = max(total - float(push @ found), LEAST_SHARE * total)
+            volume = 2.0 * float(np.log(np.diag(factor) / scale).sum())
+            volume -= float(np.log(precision[~flat]).sum())
+            out = Judged(
+                at, found + there, factor, scale, math.sqrt(variance),
+                -0.5 * (freedom_log(self._count, variance) + left / variance + volume),
+            )  # fmt: skip
+            fresh = max(left / freedom, self._floor**2)
+            if abs(math.log(fresh / variance)) < 0.02:
+                break
+            variance = fresh
+        return out
+
+
+def freedom_log(count: int, variance: float) -> float:
+    """Part of the evidence that the spread of `count` values has."""
+    return count * math.log(variance)
+
+
+def averaged(
+    models: Sequence[Judged], weights: FloatArray, count: int, at: Judged
+) -> tuple[FloatArray, FloatArray]:
+    """Mean (count,) of the first columns over models less that of `at`, and covariance about it.
+
+    Args:
+        models: judged on one table, of the same first columns.
+        weights: of the models, of sum 1.
+        count: first columns.
+        at: the model about which is averaged.
+    """
+    middle = np.zeros(count)
+    spread = np.zeros((count, count))
+    for model, weight in zip(models, weights.tolist(), strict=True):
+        off = model.mean[:count] - at.mean[:count]
+        middle += weight * off
+        spread += weight * (model.covariance(count) + np.outer(off, off))
+    return middle, spread
