@@ -17,6 +17,7 @@ from flexdt.testing.in_process import DirectProjector
 from flexdt.twin.dataset.flexdt_json import NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import Machine, builtin_machine, profile_of
+from flexdt.twin.physics.predicted_beam import Physics
 from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script import ScanPlan, parse_script, plan_script
 from flexdt.twin.script.compose import compose_script
@@ -30,9 +31,17 @@ def bead_scan(root: Path, truth: Mapping[str, float], frames: int) -> Path:
 
 
 def bead_scan_on(
-    machine: Machine, request: ScanRequest, root: Path, truth: Mapping[str, float]
+    machine: Machine,
+    request: ScanRequest,
+    root: Path,
+    truth: Mapping[str, float],
+    physics: Physics = "ideal",
 ) -> tuple[Path, ScanPlan]:
-    """The folder and the plan of a scan of any machine, `truth` hidden."""
+    """Scan the LEGO phantom on any machine, `truth` hidden.
+
+    Returns:
+        The data set's folder, and the plan.
+    """
     profile = profile_of(machine)
     script = compose_script(request, machine, profile).encode()
     plan = plan_script(parse_script(script), machine, profile)
@@ -47,7 +56,7 @@ def bead_scan_on(
         noise=NoiseRecord(3, {}),
     )  # fmt: skip
     writer = DatasetWriter(open_data(root), record, script=script, sync=False)
-    way = Radiography.of(imaging, machine, "ideal")
+    way = Radiography.of(imaging, machine, physics)
     acquisition = Acquisition(plan, way, Sample("lego"), 3, writer.put)
     for exposure in plan.exposures:
         asyncio.run(acquisition.produce([exposure]))

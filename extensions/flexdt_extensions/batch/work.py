@@ -20,6 +20,12 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.library.scan_limits import (
+    check_distances,
+    check_placement,
+    check_tube,
+    open_beam_doubts,
+)
 from flexdt.phantoms import Phantom, bead_phantom, load_phantom, material, stated_keV
 from flexdt.phantoms.channels import chain_through, channels, line_integrals
 from flexdt.twin.calibration import FitResult, bead_model, estimate_geometry
@@ -115,6 +121,12 @@ def draw_item(plan: Plan, index: int) -> Item:
         drawn["kV"], drawn["power_W"], drawn["exposure_ms"], plan.images.averages
     )
     parameters = {"phantom": described, **drawn, "errors": errors}
+    if plan.batch.kind == "projections":
+        true = poses.cone_vec(Offsets.from_edge(errors))
+        check_placement(phantom, true, shape)
+        check_tube(machine, exposure)
+        if camera is not None:
+            check_distances(machine, camera, exposure, drawn["sod_mm"], drawn["sdd_mm"])
     return Item(
         index, phantom, poses, Offsets.from_edge(errors), shape, machine, camera, exposure,
         float(drawn["noise_px"]), float(drawn["counts"]), parameters,
@@ -278,6 +290,7 @@ def run_item(text: str, index: int) -> ItemOutcome:
     try:
         item = draw_item(plan, index)
         record["parameters"] = item.parameters
+        doubts = _open_beam_doubts(plan, item)
         arrays, figures = _MAKERS[plan.batch.kind](plan, item)
     except TwinError as error:
         return ItemOutcome(index, {**record, "status": "failed", "error": str(error)})
@@ -289,7 +302,19 @@ def run_item(text: str, index: int) -> ItemOutcome:
     wanted = layout(plan)
     kept = {name: np.ascontiguousarray(kept[name], dtype=wanted[name][1]) for name in wanted}
     sums = {name: hashlib.sha256(values.tobytes()).hexdigest() for name, values in kept.items()}
-    return ItemOutcome(index, {**record, "status": "done", **figures, "sha256": sums}, kept)
+    if doubts:
+        figures = {**figures, "warnings": doubts}
+    status = "failed" if "error" in figures else "done"
+    return ItemOutcome(index, {**record, "status": status, **figures, "sha256": sums}, kept)
+
+
+def _open_beam_doubts(plan: Plan, item: Item) -> list[str]:
+    """Warn where counts of the open beam saturate or starve the panel."""
+    counted = plan.images.values == "counts" or plan.images.noise
+    if plan.batch.kind != "projections" or item.camera is None or not counted:
+        return []
+    view = item.poses.cone_vec(item.truth).rows[0]
+    return open_beam_doubts(item.machine, item.camera, item.exposure, view, plan.images.physics)
 
 
 # -- projections -----------------------------------------------------------------------------------
@@ -410,6 +435,7 @@ def _judged(
         "rms_px": None if fit is None else _finite(fit.certificate.rms_px),
         "iterations": 0 if fit is None else int(fit.iterations),
         "note": note,
+        **({"error": note or "nothing was fitted"} if fit is None else {}),
     }
 
 

@@ -595,3 +595,43 @@ def test_without_the_extra_one_line_says_what_to_install(
     size, missing = done.stderr.splitlines()
     assert size.startswith("8 items, ")
     assert "pip install 'flexdt-extensions[batch]'" in missing
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ([("images.power_W", 100_000.0)], "power_W 100000 is outside"),
+        ([("images.kV", 500.0)], "kV 500 is outside"),
+        ([("geometry.sod_mm", 5.0)], "source is inside the box around the sample"),
+        ([("geometry.lateral_mm", 900.0)], "no ray that reaches the panel meets it"),
+        (
+            [("camera", {"mode": "HW4SW1High"}), ("geometry.sod_mm", 20.0)],
+            "mag_obj target",
+        ),
+        (
+            [("camera", {"mode": "HW4SW1High"}), ("images.exposure_ms", 90_000.0)],
+            "exposure_ms 90000 is outside",
+        ),
+    ],
+)
+def test_an_item_that_no_scanner_can_make_fails_with_its_reason(
+    changes: list[tuple[str, Any]], said: str
+) -> None:
+    plan = parse_plan(varied(*changes))
+    record = run_item(plan.text, 0).record
+    assert record["status"] == "failed"
+    assert said in record["error"]
+
+
+def test_an_item_whose_open_beam_saturates_is_warned_of() -> None:
+    bright = parse_plan(
+        varied(
+            ("camera", {"mode": "HW4SW1High"}), ("images.physics", "poly"),
+            ("images.values", "counts"), ("images.exposure_ms", 5000.0), ("geometry.frames", 1),
+        )
+    )  # fmt: skip
+    outcome = run_item(bright.text, 0)
+    assert outcome.record["status"] == "done"
+    (warning,) = outcome.record["warnings"]
+    assert "would fill 90 %" in warning
+    assert outcome.arrays["projections"].max() == 16383

@@ -12,6 +12,7 @@ import math
 import shlex
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from itertools import groupby
@@ -161,6 +162,7 @@ def calibrate_datasets(
     if markers is None:
         datasets = [squared(d) for d in datasets]
     frames = [DatasetFrames(d) for d in datasets]
+    saturated = [found for d in datasets if (found := saturation(d)) is not None]
     low, high = SpotFinder().radius_px
     sought = None
     if radius_px is not None:
@@ -196,10 +198,9 @@ def calibrate_datasets(
                 Scan(f, d.poses, d.name, prior_widths(d.machine, d.profile))
                 for f, d in zip(frames, datasets, strict=True)
             ]
-            with long_work.during("calibrating"):
+            with long_work.during("calibrating"), saturation_named(saturated):
                 result = calibrate(scans, target, want, detector=sought)
-    saturated = [f for d in datasets if (f := saturation(d)) is not None]
-    result = replace(result, findings=(*result.findings, *saturated))
+    result = replace(result, findings=explained_by(saturated, result.findings))
     seconds = time.perf_counter() - start
     document = calibration_document(result, seconds) | told
     given = phantom if isinstance(phantom, str) else target.name
@@ -211,6 +212,30 @@ def calibrate_datasets(
     document["phantom"] = target.name
     document["dataset_warnings"] = [w for d in datasets for w in d.warnings]
     return Outcome(result, document, tuple(datasets), target)
+
+
+@contextmanager
+def saturation_named(saturated: Sequence[Finding]) -> Iterator[None]:
+    """Put saturated images before the message of an error that they explain.
+
+    Raises:
+        TwinError: the error that was raised, after what is saturated.
+    """
+    try:
+        yield
+    except TwinError as error:
+        if not saturated:
+            raise
+        causes = "; ".join(finding.text for finding in saturated)
+        raise TwinError(f"{causes} ({error})", error.data) from error
+
+
+def explained_by(saturated: Sequence[Finding], findings: Sequence[Finding]) -> tuple[Finding, ...]:
+    """List saturated images first, and leave out the sizes of beads that they falsify."""
+    if not saturated:
+        return tuple(findings)
+    others = (finding for finding in findings if finding.code not in OF_SATURATION)
+    return (*saturated, *others)
 
 
 def saturation(dataset: ImageSet) -> Finding | None:
@@ -254,6 +279,8 @@ def find_phantom(phantom: str | Phantom) -> Phantom:
     return found
 
 
+OF_SATURATION: Final = ("bead_size",)
+"""Codes of findings that saturated images cause."""
 NUMBERS: Final = ("value", "sigma", "low", "high", "images")
 """Of an estimate: null where they must not be used."""
 

@@ -42,9 +42,7 @@ def calibrated(
     solids = Scene(
         tuple(
             Solid(Sphere((x, y, z), r), f"material {mu:g}", mu)
-            for (x, y, z), mu, r in zip(
-                beads.tolist(), said.tolist(), radius.tolist(), strict=True
-            )
+            for (x, y, z), mu, r in zip(beads.tolist(), said.tolist(), radius.tolist(), strict=True)
         )
     )
     poses = Poses.upright(

@@ -1,0 +1,109 @@
+"""Check a scan that no script describes, as `flexdt check` checks one that a script does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.phantoms import Phantom
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.machine.camera import CameraSettings
+from flexdt.twin.machine.description import Machine, profile_of
+from flexdt.twin.physics.exposure import ExposureSettings
+from flexdt.twin.physics.predicted_beam import (
+    BRIGHTEST_FILL,
+    Physics,
+    open_beam_of,
+    proposed_setting,
+)
+from flexdt.twin.plausibility import Severity, settled
+from flexdt.twin.plausibility.examination import Operation, examine
+from flexdt.twin.scanner.state import TubeSettings, changed_tube
+from flexdt.twin.script.compose import compose_script
+from flexdt.twin.script.scan_request import ScanRequest
+
+__all__ = ["check_distances", "check_placement", "check_tube", "open_beam_doubts"]
+
+USELESS: Final = ("source in the sample", "panel in the sample", "sample not seen")
+"""Findings of a placement whose images show nothing of use."""
+
+
+def check_tube(machine: Machine, exposure: ExposureSettings) -> None:
+    """Refuse a voltage or power that the machine's tube does not have.
+
+    Raises:
+        LimitError: says what was asked and what is allowed.
+    """
+    tube = machine.tube
+    changed_tube(tube, TubeSettings(tube.kV, tube.power_W), exposure.kV, exposure.power_W)
+
+
+def check_distances(
+    machine: Machine,
+    camera: CameraSettings,
+    exposure: ExposureSettings,
+    sod_mm: float,
+    sdd_mm: float,
+) -> None:
+    """Refuse an exposure or distances that the machine does not have.
+
+    Args:
+        machine: whose camera and motors these are.
+        camera: mode and region.
+        exposure: tube and time.
+        sod_mm, sdd_mm: source to axis and to panel.
+
+    Raises:
+        LimitError: says what was asked and what is allowed.
+    """
+    wish = ScanRequest(
+        "step", sod_mm, sdd_mm, frames=2, exposure_ms=exposure.exposure_ms,
+        averages=exposure.averages, mode=camera.mode, kV=exposure.kV, power_W=exposure.power_W,
+    )  # fmt: skip
+    compose_script(wish, machine, profile_of(machine))
+
+
+def check_placement(phantom: Phantom, cone_vec: ConeVec, shape: tuple[int, int]) -> None:
+    """Refuse a source or a panel within the sample, and a sample that no ray meets.
+
+    Args:
+        phantom: stands around the origin.
+        cone_vec: the views.
+        shape: detector (rows, cols).
+
+    Raises:
+        TwinError: the first finding, with its remedy.
+    """
+    half = np.array(phantom.size_mm) / 2.0
+    found = examine(Operation.SIMULATE, cone_vec, shape, boxes=[[-half, half]])
+    settled([replace(one, severity=Severity.REFUSAL) for one in found if one.kind in USELESS])
+
+
+def open_beam_doubts(
+    machine: Machine,
+    camera: CameraSettings,
+    exposure: ExposureSettings,
+    view: npt.ArrayLike,
+    physics: Physics = "poly",
+) -> list[str]:
+    """Warn where the open beam saturates or starves the panel.
+
+    Args:
+        machine: its tube and detector.
+        camera: mode and region.
+        exposure: tube and time.
+        view: cone_vec row (12,).
+        physics: how counts are made.
+
+    Returns:
+        At most one sentence, with an exposure that would do.
+    """
+    beam = open_beam_of(machine, camera, exposure, view, physics)
+    if beam is None or not (beam.saturated or beam.starved):
+        return []
+    what = f"the open beam fills {beam.fill:.3g} of the panel's range"
+    proposal = proposed_setting(machine, exposure, beam)
+    return [f"{what}; {proposal} would fill {100 * BRIGHTEST_FILL:.0f} %"]
