@@ -305,6 +305,12 @@ class Jobs:
         known = {name: self._all.get(name) for name in sorted(names, key=number_of)}
         return {name: None if job is None else job.memory() for name, job in known.items()}
 
+    def kept_of(self, jobs: Sequence[JobMemory]) -> list[JobMemory]:
+        """Those of a server before this one, the oldest first, that are not forgotten at once."""
+        ended = [job.id for job in jobs if job.phase in ENDED]
+        forgotten = set(ended[: max(0, len(ended) - self._max_ended)])
+        return [job for job in jobs if job.id not in forgotten]
+
     def recall(self, jobs: Sequence[JobMemory], made: int, root: Directory) -> list[Job]:
         """Know the jobs of the server before this one; returns those that it left undone."""
         self._count = max(self._count, made, *(number_of(memory.id) for memory in jobs))

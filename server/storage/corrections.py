@@ -1,18 +1,21 @@
 """Corrections: dated, named and never edited, each a JSON file under DATA/corrections.
 
-Those in force, present and past, are part of the state: their names in the order in which they were
-applied. The last one is in force; None and an empty list mean nominal. A damaged file is set aside;
-if it was in force, no correction is.
+The one in force is part of the state: its name, None for nominal. Those before it, for `revert`,
+are the names in DATA/corrections/history, in the order in which they were put in force; where the
+two disagree (a kill between their writing), the state is right. A damaged file is set aside; if it
+was in force, no correction is.
 """
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, TypeAdapter
 
 from flexdt.protocol.fields import ShortText
 from flexdt.protocol.methods import document_messages as p
@@ -20,6 +23,7 @@ from flexdt.protocol.rpc_errors import invalid_params, problem
 from flexdt.runtime.files import own_documents as own
 from flexdt.runtime.files.directory import Directory
 from flexdt.server.storage.scene_document import correction_fields, correction_of
+from flexdt.twin.dataset.dataset_errors import DiskFullError
 from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.geometry.offsets import Offsets, require_plausible
 from flexdt.twin.scanner.state import NamedCorrection
@@ -28,6 +32,9 @@ KEPT = 1000
 """Corrections put in force that `revert` can go back through."""
 
 History = list[str | None]
+HISTORY = "history"
+"""File of the history: a JSON list of names, null for nominal."""
+_NAMES: TypeAdapter[History] = TypeAdapter(History)
 
 
 class CorrectionFile(p.CorrectionPart):
@@ -42,11 +49,13 @@ class Corrections:
 
     Args:
         folder: where they are kept; made when the first is stored.
-        history: names in the order in which they were put in force.
+        in_force: the name in force by the state, None for nominal; earlier servers had the whole
+            history there.
+        most: corrections there may be.
     """
 
     def __init__(
-        self, folder: Directory, history: Sequence[str | None] = (), most: int = 10_000
+        self, folder: Directory, in_force: Sequence[str | None] = (), most: int = 10_000
     ) -> None:
         self._folder, self._most = folder, most
         self._all: dict[str, NamedCorrection] = {}
@@ -59,13 +68,29 @@ class Corrections:
             if found is not None:
                 self.know(*found)
                 self._files.setdefault(found[0].name, file)
-        known = list(history)
+        without = "the history of corrections cannot be read; without it"
+        before = own.read_or_set_aside(folder, HISTORY, _read_history, without)
+        known = _joined(before or [], list(in_force))
+        self.filed = before is not None or len(known) < 2
+        """Whether the history has a file; without one it is kept in the state."""
         self.lost: str | None = None
         """The correction that was in force and is not there any more."""
         if known and known[-1] is not None and known[-1] not in self._all:
             self.lost = known[-1]
             known.append(None)
-        self.history: History = [name for name in known if name is None or name in self._all]
+        self._written: History | None = None
+        """The history that was written last."""
+        self._history: History = [name for name in known if name is None or name in self._all]
+
+    @property
+    def history(self) -> History:
+        """Names in the order in which they were put in force; None is nominal."""
+        return self._history
+
+    @history.setter
+    def history(self, names: History) -> None:
+        self._history = names
+        self.filed = self.filed or self._written == names
 
     def all(self) -> list[NamedCorrection]:
         """Every correction, oldest first."""
@@ -149,6 +174,20 @@ class Corrections:
             self._all[correction.name] = correction
             self._sources[correction.name] = source
 
+    def in_state(self, history: History) -> History:
+        """What the state has of a history: what is in force, or all where it has no file."""
+        return history[-1:] if self.filed else history
+
+    def store_history(self, changes: own.Changes, history: History) -> None:
+        """Write the history; on a full disk it stays as it was, which costs steps of `revert` only.
+
+        Raises:
+            DatasetWriteError: the system cannot write.
+        """
+        with suppress(DiskFullError):
+            changes.put(self._folder, HISTORY, json.dumps(history).encode())
+            self._written = history
+
     def without(self, name: str) -> History:
         """The history once the correction called `name` is deleted.
 
@@ -186,6 +225,19 @@ class Corrections:
 def _file(correction: NamedCorrection) -> str:
     stamp = correction.date.split(".")[0].replace(":", "")
     return f"{stamp} {own.file_stem(correction.name)}.json"
+
+
+def _joined(before: History, in_force: History) -> History:
+    """The history by its file and by the state, of which the state is right."""
+    if len(in_force) != 1:
+        return in_force
+    [name] = in_force
+    there = [i for i, known in enumerate(before) if known == name]
+    return before[: there[-1] + 1] if there else [*before, name]
+
+
+def _read_history(data: bytes) -> History:
+    return _NAMES.validate_python(own.read_json(data), strict=True)[-KEPT:]
 
 
 def _read(data: bytes) -> tuple[NamedCorrection, str | None]:

@@ -15,10 +15,12 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
+from itertools import islice
 from typing import Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -41,6 +43,8 @@ FILE = "state.json"
 INTERVAL_S = 0.25
 """Real seconds between two writes, at least."""
 ChangedJobs = dict[str, JobMemory | None]
+JOBS_A_TURN = 200
+"""Jobs that are written while other changes wait."""
 FAR_S = 60.0
 """After a write that failed (a full disk), the next one waits so long [s]."""
 
@@ -59,7 +63,7 @@ class Memory(_Part):
     Attributes:
         jobs: as earlier servers kept them; those that have no file yet.
         jobs_made: jobs there ever were.
-        corrections: names in the order in which they were put in force; None is nominal.
+        corrections: the name in force, None for nominal; several where their history has no file.
     """
 
     schema_version: Literal[1] = Field(alias="schema")
@@ -87,7 +91,7 @@ def remember(
         scanner: as it is.
         now: twin time [s].
         made: jobs there ever were.
-        corrections: the history of corrections.
+        corrections: as `Memory` has them.
         unfiled: jobs of an earlier server that could not be given files yet.
         ended: whether the server has ended.
     """
@@ -112,7 +116,7 @@ def as_of(
     Args:
         memory: as it is; its positions stay.
         scanner: as it will be.
-        corrections: the history of corrections; None leaves it.
+        corrections: as `Memory` has them; None leaves them.
     """
     scene = save_scene(scanner, 0.0).model_copy(update={"positions": memory.scene.positions})
     names = memory.corrections if corrections is None else corrections
@@ -232,6 +236,8 @@ class StateStore:
                 self._note(str(error))
                 raise
             self._note(None)
+            if self._unwritten:
+                self._changed.set()
 
     async def keep(
         self,
@@ -282,7 +288,7 @@ class StateStore:
     def end(self) -> None:
         """Write for the last time; a write that is still on its way does not undo it."""
         try:
-            self._put(self._make(True), self._unwritten_jobs())
+            self._put(self._make(True), self._unwritten_jobs(most=sys.maxsize))
         except (OSError, DatasetError) as error:
             log("the state was not written", logging.ERROR, reason=str(error))
 
@@ -294,10 +300,14 @@ class StateStore:
         """Whether a change of a job is still to be written."""
         return job in self._unwritten
 
-    def _unwritten_jobs(self) -> ChangedJobs:
-        """Jobs to write: those that have changed, and those that could not be written before."""
-        self._unwritten |= self._changed_jobs()
-        return dict(self._unwritten)
+    def _unwritten_jobs(self, most: int = JOBS_A_TURN) -> ChangedJobs:
+        """Jobs to write: those that have changed now, then those left from before.
+
+        Thousands may be forgotten at once; then requests are served between turns.
+        """
+        now = self._changed_jobs()
+        self._unwritten |= now
+        return now | dict(islice(self._unwritten.items(), max(0, most - len(now))))
 
     def _put(self, memory: Memory, jobs: ChangedJobs) -> None:
         # Ending cancels the task that waits for a worker thread, but not the thread.

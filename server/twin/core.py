@@ -301,7 +301,7 @@ class TwinServer:
         if memory is None:
             return self.jobs.recall(jobs, 0, self.directory)
         there = {job.id for job in jobs}
-        unfiled = [job for job in memory.jobs if job.id not in there]
+        unfiled = self.jobs.kept_of([job for job in memory.jobs if job.id not in there])
         try:
             for job in unfiled:
                 self.job_files.write(job.id, job)
@@ -433,7 +433,7 @@ class TwinServer:
         return self.scanner.rest_time(now) > now
 
     def _memory(self, ended: bool) -> kept.Memory:
-        history = self.corrections.history
+        history = self.corrections.in_state(self.corrections.history)
         self._unfiled = [job for job in self._unfiled if self.keeper.is_unwritten(job.id)]
         return kept.remember(
             self.scanner, self.clock.now(), self.jobs.made, history,

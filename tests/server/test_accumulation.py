@@ -324,3 +324,43 @@ def test_there_is_a_most_of_samples_and_corrections(tmp_path: Path) -> None:
         await c.call("calibration.apply", parameters={"dD_x": 0.1}, name="a")  # it is there
 
     run(tmp_path, body, limits=TwinLimits(max_samples=2, max_corrections=2))
+
+
+@pytest.mark.daily(1)
+@pytest.mark.parametrize("seed", range(6))
+def test_revert_goes_back_through_what_was_put_in_force_whatever_was_killed(
+    seed: int, tmp_path: Path
+) -> None:
+    """The history has a file of its own; a stack of names is the judge."""
+    rng, sim = random.Random(seed), Simulation(tmp_path, seed)
+    stack: list[str | None] = []
+    with sim:
+        sim.start()
+        client = sim.client()
+        for step in range(25):
+            name = f"c{rng.randint(0, 6)}"
+            if rng.random() < 0.6:
+                number = int(name[1:])
+                sim.call(client, "calibration.apply", parameters={"dD_x": number / 8}, name=name)
+                stack.append(name)
+            elif stack:
+                sim.call(client, "calibration.revert")
+                stack.pop()
+            if rng.random() < 0.3:
+                sim.kill()
+                if step == 10:  # as an earlier version left it: all in the state, and no file
+                    state = json.loads((sim.data / "state.json").read_text())
+                    state["corrections"] = stack
+                    (sim.data / "state.json").write_text(json.dumps(state))
+                    (sim.data / "corrections" / "history").unlink(missing_ok=True)
+                sim.start()
+                client = sim.client()
+            found = sim.call(client, "calibration.get")["correction"]
+            assert (found and found["name"]) == (stack[-1] if stack else None)
+        size = len(json.loads((sim.data / "state.json").read_text())["corrections"])
+        assert size <= 1
+        while stack:
+            sim.call(client, "calibration.revert")
+            stack.pop()
+            found = sim.call(client, "calibration.get")["correction"]
+            assert (found and found["name"]) == (stack[-1] if stack else None)

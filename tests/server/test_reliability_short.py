@@ -55,6 +55,18 @@ def test_new_clients_are_answered_beside_a_flood_of_connections() -> None:
 
 
 @pytest.mark.campaign
+def test_an_old_twin_costs_what_a_young_one_does() -> None:
+    few = ("--samples", "60", "--corrections", "60", "--scans", "5", "--requests", "20")
+    out = run("age.py", "--jobs", "20000", *few, "--allowed", "0.6")  # few requests: rough figures
+    assert "0 figures have grown" in out
+
+
+def test_full_disks_lose_nothing() -> None:
+    out = run("full_disk.py", "--histories", "6", "--seed", "40", "--jobs", "1")
+    assert "0 lost something acknowledged" in out
+
+
+@pytest.mark.campaign
 def test_many_clients_keep_their_order() -> None:
     out = run("load.py", "--clients", "30", "--seconds", "2")
     assert out.count("0 out of order, 0 cut off") == 2

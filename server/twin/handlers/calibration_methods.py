@@ -8,6 +8,7 @@ from flexdt.protocol.fields import Empty, Params
 from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods import calibration_messages as p
 from flexdt.protocol.methods.calibration_messages import DATASET_FRAME, DATASET_GET, DATASET_LIST
+from flexdt.runtime.files.own_documents import Changes
 from flexdt.server.storage.memory import Memory
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers import handler as h
@@ -71,15 +72,17 @@ async def delete(
         ready = h.ensure_allowed(twin, client, "calibration.delete")
 
         def after(memory: Memory) -> Memory:
-            return memory.model_copy(update={"corrections": history})
+            return memory.model_copy(update={"corrections": twin.corrections.in_state(history)})
+
+        def files(changes: Changes) -> None:
+            twin.corrections.store_history(changes, history)
+            twin.corrections.remove(changes, params.name)
 
         def take() -> None:
             ready()
             twin.corrections.forget(params.name, history)
 
-        await twin.keeper.keep(
-            take, after, lambda changes: twin.corrections.remove(changes, params.name)
-        )
+        await twin.keeper.keep(take, after, files)
     twin.tell("info", f"correction {params.name!r} was deleted")
     return p.CorrectionDeleted(name=params.name)
 

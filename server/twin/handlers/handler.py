@@ -182,13 +182,15 @@ async def change_stage(
             twin.samples.store(changes, upload)
         if correction is not None:
             twin.corrections.store(changes, correction, source)
+        if history is not None:
+            twin.corrections.store_history(changes, history)
 
     def after(memory: Memory) -> Memory:
         trial = copy.copy(scanner)
         trial.sample, trial.correction = sample, correction
         if scene is not None:
             apply_settings(scene, trial)
-        return as_of(memory, trial, names)
+        return as_of(memory, trial, twin.corrections.in_state(names))
 
     def take() -> list[str]:
         ready()
