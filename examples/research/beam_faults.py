@@ -38,6 +38,8 @@ Array = npt.NDArray[np.float64]
 Rng = np.random.Generator
 
 WRONG_SIGMAS: Final = 4.0
+EXPOSED: Final = 12
+"""Moments of an exposure while the object turns."""
 ENERGIES: Final = {40.0: 0.35, 60.0: 0.40, 90.0: 0.25}
 """Photon energies of the beam [keV] and their parts of the signal."""
 ATTENUATION: Final = {
@@ -64,6 +66,9 @@ class Laboratory:
         dead: part of the pixels without a signal.
         drift: of the beam's brightness over the scan.
         ceiling: largest count as part of the open beam.
+        strain: (3, 3) of the phantom, by which its balls are displaced; none.
+        arc: part of a step by which the object turns while a frame is exposed.
+        shown: (n,) angles of the frames -> those that they show; none: their own.
     """
 
     ball: str = "steel"
@@ -80,6 +85,9 @@ class Laboratory:
     dead: float = 0.0
     drift: float = 0.0
     ceiling: float = math.inf
+    strain: Array | None = None
+    arc: float = 0.0
+    shown: Callable[[Array, Rng], Array] | None = None
 
 
 def rays(truth: Mapping[str, float], step: int = 1) -> Array:
@@ -104,26 +112,18 @@ def radiographs(
     lab: Laboratory, rng: Rng, beads: Array, angles: Array, truth: Mapping[str, float]
 ) -> list[npt.NDArray[np.float32]]:
     """Line integrals as a camera makes them, from flat-corrected counts."""
-    ends = np.array([[0.0, 0.0, -30.0], [0.0, 0.0, 30.0]])
-    at, panel = own.places(np.concatenate([beads, ends]), angles, own.SOD, truth)
-    energies = [1] if lab.mono else [0, 1, 2]
-    parts = np.array(list(ENERGIES.values()))[energies]
-    parts /= parts.sum()
-    ball, body = (np.array(ATTENUATION[m])[energies] for m in (lab.ball, lab.body))
+    if lab.strain is not None:
+        beads = beads + beads @ lab.strain.T
+    step = angles[1] - angles[0]
+    if lab.shown is not None:
+        angles = lab.shown(angles, rng)
     straight = rays(truth)
     dead = rng.random(own.SHAPE) < lab.dead
     before, out = None, []
-    middles = own.pixels(beads, angles, own.SOD, truth)
-    for i in range(len(angles)):
-        shown = np.zeros(own.SHAPE)
-        inside = cylinder(straight, *at[i, -2:], lab.body_mm) if lab.body != "air" else 0.0 * shown
-        through = [np.zeros(own.SHAPE) for _ in energies]
-        for place, centre in zip(at[i, :-2], middles[i], strict=True):
-            where, passed = own.shadow(place, centre, panel, lab.cast_mm, own.SOD)
-            for e in range(len(energies)):  # a ball takes its place in the body
-                through[e][where] -= np.log(passed(ball[e] - body[e]))
-        for e, weight in enumerate(parts):
-            shown += weight * np.exp(-body[e] * inside - through[e])
+    parts = (np.arange(EXPOSED) + 0.5) / EXPOSED - 0.5 if lab.arc else np.zeros(1)
+    for i, angle in enumerate(angles.tolist()):
+        some = angle + lab.arc * step * parts
+        shown = np.mean([light(lab, beads, float(a), truth, straight) for a in some], axis=0)
         if lab.shift is not None:
             shown = _shifted(shown, lab.shift)
         shown = _blurred(shown, lab.blur_px) + lab.scatter
@@ -134,6 +134,29 @@ def radiographs(
         counts = np.where(dead, 0.0, counts)
         out.append((-np.log(np.maximum(counts, 0.5) / lab.photons)).astype(np.float32))
     return out
+
+
+def light(
+    lab: Laboratory, beads: Array, angle: float, truth: Mapping[str, float], straight: Array
+) -> Array:
+    """What part of the beam passes at one angle, (rows, cols)."""
+    ends = np.array([[0.0, 0.0, -30.0], [0.0, 0.0, 30.0]])
+    turn = np.array([angle])
+    (at,), panel = own.places(np.concatenate([beads, ends]), turn, own.SOD, truth)
+    energies = [1] if lab.mono else [0, 1, 2]
+    parts = np.array(list(ENERGIES.values()))[energies]
+    parts /= parts.sum()
+    ball, body = (np.array(ATTENUATION[m])[energies] for m in (lab.ball, lab.body))
+    shown = np.zeros(own.SHAPE)
+    inside = cylinder(straight, *at[-2:], lab.body_mm) if lab.body != "air" else 0.0 * shown
+    through = [np.zeros(own.SHAPE) for _ in energies]
+    for place, centre in zip(at[:-2], own.pixels(beads, turn, own.SOD, truth)[0], strict=True):
+        where, passed = own.shadow(place, centre, panel, lab.cast_mm, own.SOD)
+        for e in range(len(energies)):  # a ball takes its place in the body
+            through[e][where] -= np.log(passed(ball[e] - body[e]))
+    for e, weight in enumerate(parts):
+        shown += weight * np.exp(-body[e] * inside - through[e])
+    return shown
 
 
 def _blurred(image: Array, blur: tuple[float, float, float]) -> Array:
@@ -178,6 +201,45 @@ def _with(**fields: object) -> Change:
     return lambda lab, rng: replace(lab, **fields)  # type: ignore[arg-type]
 
 
+def _strained(i: int, j: int) -> Change:
+    """A phantom that is off by .05 to 1 % in one way."""
+
+    def change(lab: Laboratory, rng: Rng) -> Laboratory:
+        strain = np.zeros((3, 3))
+        strain[i, j] = rng.choice([-1, 1]) * math.exp(rng.uniform(math.log(5e-4), math.log(1e-2)))
+        return replace(lab, mono=True, strain=strain)
+
+    return change
+
+
+def _as_assumed(lab: Laboratory, rng: Rng) -> Laboratory:
+    return replace(lab, mono=True, strain=1e-3 * rng.normal(size=(3, 3)))
+
+
+def _renumbered(shift: int, stays: bool) -> Change:
+    """From a frame on, or in that frame alone, images are those of `shift` frames later."""
+
+    def shown(angles: Array, rng: Rng) -> Array:
+        n = len(angles)
+        at = int(rng.integers(1, n))
+        later = np.arange(n) >= at if stays else np.arange(n) == at
+        return angles + (angles[1] - angles[0]) * shift * later
+
+    return lambda lab, rng: replace(lab, mono=True, shown=shown)
+
+
+def _four_tiles(rng: Rng) -> tuple[Array, Array]:
+    """Two columns and two rows of tiles, with a gap between each."""
+    row, column = np.mgrid[: own.SHAPE[0], : own.SHAPE[1]].astype(float)
+    gaps = rng.uniform(0.5, 2.0, size=2)
+    low, right = (
+        at > side * rng.uniform(0.42, 0.58)
+        for at, side in zip((row, column), own.SHAPE, strict=True)
+    )
+    return np.where(low, -gaps[0], 0.0), np.where(right, -gaps[1], 0.0)
+
+
+SHAPED: Final = "phantom_strained|bead_tolerance|causes_open"
 BODY: Final = {"body": "pmma", "body_mm": 30.0}
 METAL: Final = {"body": "aluminium", "body_mm": 20.0}
 KINDS: Final[Mapping[str, tuple[Change, str]]] = {
@@ -216,6 +278,22 @@ KINDS: Final[Mapping[str, tuple[Change, str]]] = {
     "smaller_balls": (_with(cast_mm=0.92), "bead_size"),
     "larger_in_aluminium": (
         _with(cast_mm=1.08, **METAL), "bead_size",
+    ),
+    # A printed phantom as good as is assumed: to be offered; others, and what cameras do.
+    "as_assumed": (_as_assumed, ""),
+    "strain_x": (_strained(0, 0), SHAPED),
+    "strain_z": (_strained(2, 2), SHAPED),
+    "strain_shear": (_strained(0, 1), SHAPED),
+    "strain_lean": (_strained(0, 2), SHAPED),
+    "exposed_long": (
+        lambda lab, rng: replace(lab, mono=True, arc=rng.uniform(0.1, 1.0)),
+        f"exposure_arc|{SHAPED}",
+    ),
+    "frame_doubled": (_renumbered(-1, True), "frame_numbers|frames_inconsistent"),
+    "frame_lost": (_renumbered(1, True), "frame_numbers|frames_inconsistent"),
+    "exposed_again": (_renumbered(-1, False), "frames_inconsistent"),
+    "four_tiles": (
+        lambda lab, rng: replace(lab, mono=True, shift=_four_tiles(rng)), "panel_distorted",
     ),
 }  # fmt: skip
 """Each kind: what it changes, and what names it."""

@@ -41,7 +41,7 @@ from flexdt.twin import long_work
 from flexdt.twin.calibration.detect.detection import SpotFinder
 from flexdt.twin.calibration.diagnose import Finding, Severity
 from flexdt.twin.calibration.fit.certificate import Estimate
-from flexdt.twin.calibration.fit.fit import image_quantities
+from flexdt.twin.calibration.fit.fit import FitResult, image_quantities
 from flexdt.twin.calibration.fit.priors import prior_widths
 from flexdt.twin.calibration.fit.problem import SIX, from_printed_reading
 from flexdt.twin.calibration.pipeline import Calibration, CalibrationRequest, Scan, calibrate
@@ -411,7 +411,7 @@ def verdict_of(result: Calibration, seen: Sequence[Mapping[str, Estimate]]) -> s
         weak = () if result.fit is None else result.fit.certificate.weak
         why = [f.text for f in result.errors] or list(weak) or ["there is no fit"]
         return f"Not to be used: {why[0]}."
-    column = max((q["axis_column"] for q in seen), key=lambda e: e.sigma)
+    column = _column(seen)
     use = "Safe to reconstruct" if column.sigma <= SHARP_PX else "Too uncertain for a sharp volume"
     if result.fit.panel is not None:
         use += " with this correction, which undoes the panel's distortion"
@@ -430,6 +430,16 @@ def verdict_of(result: Calibration, seen: Sequence[Mapping[str, Estimate]]) -> s
     return f"{first}{second}."
 
 
+def _column(seen: Sequence[Mapping[str, Estimate]]) -> Estimate:
+    """Give the axis's column of the group of frames that tells it least."""
+    return max((q["axis_column"] for q in seen), key=lambda e: e.sigma)
+
+
+def _is_sharp(fit: FitResult) -> bool:
+    """Whether the axis's column is known well enough for a sharp volume."""
+    return _column(image_quantities(fit)).sigma <= SHARP_PX
+
+
 def next_commands(result: Calibration, data: Sequence[str], phantom: str) -> list[str]:
     """Commands that would tell more, or settle what forbids the result; most useful first."""
     names = " ".join(shlex.quote(one) for one in data)
@@ -444,7 +454,9 @@ def next_commands(result: Calibration, data: Sequence[str], phantom: str) -> lis
         "flexdt reconstruct SAMPLE --correction REPORT.json --out volume.tif"
         "  # REPORT.json: of this command with --report"
     ]
-    if result.identifiable and not any(_by_priors(e) for e in asked):
+    limited = any(_by_priors(e) for e in asked)
+    sharp = result.fit is not None and result.identifiable and _is_sharp(result.fit)
+    if sharp and not limited:
         return use
     sod = float(result.scans[0].poses.sod.mean())
     places = f"--position {sod:.0f} --position {ELSEWHERE * sod:.0f}"
@@ -452,7 +464,7 @@ def next_commands(result: Calibration, data: Sequence[str], phantom: str) -> lis
         f"flexdt script new --kind calibration {places} --out two-places.txt",
         f"flexdt calibrate PLACE-1 PLACE-2 --phantom {shlex.quote(phantom)}",
     ]
-    if not result.identifiable:
+    if not sharp:
         return closer
     return [
         *use,

@@ -37,6 +37,8 @@ from flexdt.twin.geometry.panel import Border, PanelModel
 
 NAMED: Final = math.log(1e4)
 """Logarithm of the odds from which a cause is named."""
+OPEN: Final = math.log(100.0)
+"""Logarithm of the odds against a cause up to which it is left open."""
 CHANCE: Final = math.log(0.1)
 """Logarithm of the probability that a scan has a cause, before it is seen; assumed."""
 OUTLIER: Final = 5.0
@@ -50,6 +52,8 @@ MOTION_WIDTHS: Final = (1.0, 4.0, 16.0, 64.0)
 WAVES: Final = 8
 """Shapes that a motion may have here: a ramp, and half waves in a scan."""
 PRIOR_FACTORS: Final = (3.0, 10.0)
+PRIOR_CHANCE: Final = math.log(1e-3)
+"""The same that the scanner is so many times further off than is said; assumed."""
 LEAST_MOVING: Final = 12
 """Frames of a scan from which motion is told from noise."""
 MOST_ROUNDS: Final = 4
@@ -99,7 +103,7 @@ class Found:
         odds: logarithm of the odds of each cause, by name; borders by their place.
         applied: names of causes that are columns of the fit.
         open: names of causes that the data neither show nor exclude.
-        strain: of the phantom, averaged: (9,) and its covariance (9, 9); None: it is not judged.
+        strain: of the phantom, averaged: (10,) and its covariance (10, 10); None: it is not judged.
     """
 
     odds: dict[str, float] = field(default_factory=dict)
@@ -209,7 +213,7 @@ class Candidates:
             widths = tuple(w * self.noise for w in MOTION_WIDTHS)
             out.append(Cause(MOTION_OF + name, columns, widths))
             first += WAVES
-        out.append(Cause("priors", (), PRIOR_FACTORS))
+        out.append(Cause("priors", (), PRIOR_FACTORS, PRIOR_CHANCE))
         return tuple(out)
 
     def judged(self, choice: Choice) -> Judged | None:
@@ -298,7 +302,7 @@ class Candidates:
         return at.mean[:count] + middle, spread, at.covariance(count)
 
     def strain(self, choice: Choice) -> tuple[FloatArray, FloatArray] | None:
-        """The phantom's strain (9,) averaged over all choices, and its covariance; None where it
+        """The phantom's strain (10,) averaged over all choices, and its covariance; None where it
         has none in some."""
         if not min(self.known.strain) > 0:
             return None
@@ -378,7 +382,7 @@ def explained_by_causes(fit: FitResult, known: Known, refit: Refit) -> tuple[Fit
         c.name for c, pick in zip(candidates.causes, choice, strict=True)
         if pick and not c.name.startswith(RIVALS)
     )  # fmt: skip
-    doubtful = tuple(n for n, o in odds.items() if abs(o) < NAMED and not n.startswith(RIVALS))
+    doubtful = tuple(n for n, o in odds.items() if -OPEN < o < NAMED and not n.startswith(RIVALS))
     found = Found(odds, names, doubtful, candidates.strain(choice))
     return _widened(fit, candidates, choice), found
 

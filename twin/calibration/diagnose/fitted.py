@@ -52,6 +52,12 @@ PLAUSIBLE_SHARE = 0.12
 """Largest offset along the beam, as a share of SOD, that a mount may cause. A phantom that is
 scaled together with its beads looks like the right one at another distance, so that this offset is
 its only sign."""
+ALIKE_MOTION: Final = {
+    "dO_x": "the source moves aside, the other way",
+    "dO_y": "the source moves up or down, the other way",
+    "dO_z": "the phantom grows or shrinks",
+}
+"""What looks like a motion of the object in the images."""
 OF_MOTION: Final = frozenset(("drift", "vibration", "angles_wrong"))
 """What is called so may be followed from frame to frame."""
 EXPLAINED_PX: Final = 0.2
@@ -265,8 +271,8 @@ def _drifts(fit: FitResult) -> list[Finding]:
             warning(
                 "drift",
                 f"{drift.column} changes by {drift.size:+.3g} {unit} {how} ({drift.score:.0f} "
-                "sigma); its interval contains the change, and --per-frame "
-                f"{drift.column.split('@')[0]} would follow it",
+                f"sigma){_looks_alike(drift.column)}; its interval contains the change, and "
+                f"--per-frame {','.join(MOVING)} would follow it",
             )
         )
     for there, code, what in (
@@ -279,6 +285,12 @@ def _drifts(fit: FitResult) -> list[Finding]:
         if there:
             out.append(warning(code, f"{what}: the intervals allow for it"))
     return out
+
+
+def _looks_alike(column: str) -> str:
+    """What else looks like a change of a parameter."""
+    name = column.split("@")[0]
+    return f" (or {ALIKE_MOTION[name]}, which looks alike)" if name in ALIKE_MOTION else ""
 
 
 def _lost_beads(fit: FitResult) -> list[Finding]:
@@ -373,7 +385,8 @@ def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding |
     code = "vibration" if how.startswith("from frame") else "drift"
     return error(
         code,
-        f"{', '.join(said)} moves during the scan, {how}: --per-frame {','.join(names)} follows it",
+        f"{', '.join(said)} moves during the scan, {how}{_looks_alike(name)}: --per-frame "
+        f"{','.join(names)} follows it",
     )
 
 

@@ -213,9 +213,24 @@ def judge_priors(loose: FitResult, exact: Container[str] = ()) -> PriorsJudged:
         + f", the images say {means[i] + alone[i][0]:.4g} +- {alone[i][1]:.1g} {found[i].unit}"
         for i in likely
     ]
+    if "dD_z" in causes:
+        texts.append(
+            _other_pixels(loose, means[names.index("dD_z")] + alone[names.index("dD_z")][0])
+        )
     which = " or ".join(causes)
     text = f"{'; or '.join(texts)}: free {which} too, or give the prior it has"
     return PriorsJudged(error("held_parameter", text), 1.0, causes)
+
+
+def _other_pixels(fit: FitResult, dD_z: float) -> str:
+    """Say which pixels would look like a panel `dD_z` [mm] further away."""
+    poses = fit.problem.poses
+    pixel = float(np.median(np.linalg.norm(poses.u, axis=1)))
+    sdd = float(np.median(poses.sdd))
+    return (
+        f"the pixels are {pixel * sdd / (sdd + dD_z):.4g} mm wide instead of {pixel:.4g} mm, which "
+        "looks alike"
+    )
 
 
 def doubtful(

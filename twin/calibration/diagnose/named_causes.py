@@ -26,7 +26,7 @@ ALIKE: Final = ("arc", "beads", "panel")
 TERMS: Final[dict[str, dict[str, float]]] = {
     "taller": {"zz": 1.0, "xx": -0.5, "yy": -0.5},
     "longer along x than along y": {"xx": 1.0, "yy": -1.0},
-    "sheared across": {"xy": 2.0},
+    "sheared across": {"xy": 1.0, "yx": 1.0},
     "aslant along x": {"xz": 1.0},
     "tilted along x": {"zx": 1.0},
     "aslant along y": {"yz": 1.0},

@@ -51,6 +51,11 @@ SOURCES = {
     "panel": "the panel's distortion",
 }
 """What columns that are no parameters belong to, by the first word of their names."""
+MEASURE = {
+    SOURCES["bead"]: "beads measured more exactly would tell more",
+    SOURCES["strain"]: "a measured distance of two beads, and --bead-tolerance, would tell more",
+}
+"""What tells more where a sigma is limited by one of them."""
 WEAK_CONDITION = 500.0
 """A column-scaled condition number above this makes the smallest direction weak."""
 
@@ -260,10 +265,8 @@ class Certificate:
         for name, e in self.estimates.items():
             if e.asked and e.sigma**2 > 2 * e.images**2 and e.priors:
                 sources = list(e.priors)
-                better = (
-                    "beads measured more exactly would tell more"
-                    if sources[0] == "beads"
-                    else "a second placement at another SOD in the same fit would tell more"
+                better = MEASURE.get(
+                    sources[0], "a second placement at another SOD in the same fit would tell more"
                 )
                 out[name] = (
                     f"+- {e.sigma:.2g} {e.unit}, of it {e.images:.1g} from the images and the rest "

@@ -24,6 +24,7 @@ import numpy.typing as npt
 from scipy import linalg
 
 from flexdt.twin.calibration.fit.certificate import widened
+from flexdt.twin.calibration.fit.evidence import Table
 from flexdt.twin.calibration.fit.fit import LEAST_NOISE, FitResult
 from flexdt.twin.calibration.fit.problem import FitProblem, edge_factor, layout
 from flexdt.twin.calibration.fit.residual_structure import cross
@@ -43,6 +44,8 @@ DOUBT: Final = 2.0
 ONCE: Final = 2
 """Half waves of the cosine that goes once through a scan."""
 MOST_PASSES: Final = 6
+BESIDE_BEAM: Final = 0.01
+"""Standard deviation of the slope of a motion along the beam against it: 6 mm in 600; assumed."""
 EVIDENCE: Final = 6.0
 """Gain in log likelihood from which a parameter counts as moving: white noise has it in less than
 one of a thousand fits (55 pairs of width and smoothness are tried)."""
@@ -171,7 +174,42 @@ def aware(fit: FitResult, held: MotionFit) -> FitResult:
         return fit
     names = held.motions[0].names
     more = estimate_motion(fit, names, held, search=False).covariance
+    more = more + _along_the_beam(fit, held)
     return replace(fit, certificate=widened(fit.certificate, more))
+
+
+def _along_the_beam(fit: FitResult, held: MotionFit) -> FloatArray:
+    """Covariance (p, p), edge units, that a motion along the beam adds as its way is not exactly
+    the beam's: a phantom that grows moves, as seen, away from where it hangs.
+
+    The slopes of the way are two more columns with a prior; what they change is taken as an error.
+    """
+    problem, x = fit.problem, fit.solution.x
+    count = problem.layout.parameter_count
+    names = held.motions[0].names
+    if "dO_z" not in names:
+        return np.zeros((count, count))
+    along = np.concatenate([m.values[:, names.index("dO_z")] for m in held.motions])
+    use = fit.solution.use
+    keep = np.repeat(use.ravel(), 2)
+    frame = np.repeat(np.arange(len(along)), 2 * problem.seen.shape[1])
+    aside = [along[frame] * derivative(problem, fit, name, use) for name in ("dO_x", "dO_y")]
+    rows = np.column_stack([problem.jacobian(x, use), *aside])[keep]
+    size = len(x)
+    table = Table(rows, problem.whitened(x).ravel()[keep], LEAST_NOISE)
+    widths = np.append(problem.prior_sigma, [BESIDE_BEAM] * 2)
+    means = np.append(problem.prior_mean - x, [0.0, 0.0])
+    exact, free = (
+        table.judged(range(n), widths[:n], fit.certificate.noise, means[:n])
+        for n in (size, size + 2)
+    )
+    if exact is None or free is None:
+        return np.zeros((count, count))
+    off = free.mean[:count] - exact.mean[:count]
+    more = free.covariance(count) - exact.covariance(count) + np.outer(off, off)
+    values, vectors = np.linalg.eigh(more)
+    factor = np.array([edge_factor(name) for name in problem.layout.names[:count]])
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(factor, factor))
 
 
 def _used(problem: FitProblem, fit: FitResult) -> npt.NDArray[np.bool_]:

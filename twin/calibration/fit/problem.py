@@ -33,9 +33,9 @@ SIX = ("dO_x", "dO_y", "dO_z", "alpha", "tau_x", "tau_z")
 EIGHT = (*SIX, "dD_x", "dD_y")
 """The thesis's extended vector, eq. 5.19."""
 
-STRAINS = ("scale", "xx", "yy", "zz", "xy", "xz", "zx", "yz", "zy")
+STRAINS = ("scale", "xx", "yy", "zz", "xy", "yx", "xz", "zx", "yz", "zy")
 """Growth of the whole, and displacements of beads along the first axis that grow with the second
-coordinate, but xy, which is the shear in both; a turn about the vertical is alpha."""
+coordinate."""
 STRETCHES = 4
 """The first of them; the others are shears."""
 Strain = tuple[float, float]
@@ -301,13 +301,12 @@ class FitProblem:
 
     @cached_property
     def strain_basis(self) -> FloatArray:
-        """(3 k, 9) displacement of the beads' coordinates [mm] by a unit of each strain."""
+        """(3 k, 10) displacement of the beads' coordinates [mm] by a unit of each strain."""
         beads = self.model.beads
         out = np.zeros((len(beads), 3, len(STRAINS)))
         out[..., 0] = beads
         for i, term in enumerate(STRAINS[1:], 1):
             out[:, "xyz".index(term[0]), i] = beads[:, "xyz".index(term[1])]
-        out[:, 1, STRAINS.index("xy")] = beads[:, 0]
         return out.reshape(-1, len(STRAINS))
 
     @cached_property
@@ -511,7 +510,7 @@ def build_problem(
 
 
 def strain_widths(strain: Strain) -> FloatArray:
-    """Standard deviation of each of STRAINS, (9,)."""
+    """Standard deviation of each of STRAINS, (10,)."""
     stretch, shear = (max(width, LEAST_STRAIN) for width in strain)
     return np.array([stretch] * STRETCHES + [shear] * (len(STRAINS) - STRETCHES))
 
