@@ -11,7 +11,7 @@ from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.diagnose.fitted import (
     MISFIT_PX,
 )
-from flexdt.twin.calibration.fit.priors import ASSUMED, FIXED, require_widths
+from flexdt.twin.calibration.fit.priors import ASSUMED, known, require_widths
 from flexdt.twin.calibration.fit.problem import (
     SIX,
     UNSTRAINED,
@@ -104,12 +104,7 @@ def priors_of(scans: Sequence[Scan], request: CalibrationRequest) -> dict[str, f
 
 def stated_priors(scans: Sequence[Scan], request: CalibrationRequest) -> dict[str, float]:
     """Give the request's priors, and the widest of the scans' for what is not free; 0: exact."""
-    out: dict[str, float] = {n: w for n, w in FIXED.items() if n not in request.free}
-    for scan in scans:
-        for name, width in scan.priors.items():
-            if name not in request.free:
-                out[name] = max(out.get(name, 0.0), width)
-    return out | {n: w for n, w in request.priors.items() if w > 0 or n not in request.free}
+    return known(request.free, request.priors, [scan.priors for scan in scans])
 
 
 def strain_prior(model: BeadModel, request: CalibrationRequest) -> Strain:

@@ -32,6 +32,9 @@ from pydantic import (
 
 from flexdt.extending import CommandError
 from flexdt.twin.calibration import SIX
+from flexdt.twin.calibration.fit.priors import NOISE_PX, exact
+from flexdt.twin.calibration.request import CalibrationRequest
+from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.offsets import NAMES
 from flexdt_extensions.executors import problems_of, read_toml
 
@@ -288,7 +291,12 @@ class Calibrate(_Table):
 
     fidelity: Literal["points", "images"] = "points"
     free: Annotated[list[str], Len(1, len(NAMES))] = Field(default_factory=lambda: list(SIX))
-    noise_px: Positive = _fixed(0.1)
+    priors: dict[str, Annotated[float, Ge(0)]] | Literal["none"] | None = Field(
+        default=None,
+        description="what is known of other parameters [mm, deg, 1], in place of what is assumed; "
+        "none: all exactly",
+    )
+    noise_px: Positive = _fixed(NOISE_PX)
     counts: Positive = Field(
         default=_fixed(5000.0), description="open-beam photons a pixel, for images"
     )
@@ -299,7 +307,16 @@ class Calibrate(_Table):
         wrong = [n for n in self.free if n not in NAMES]
         if wrong:
             raise ValueError(f"free: unknown parameters {wrong}; allowed: {', '.join(NAMES)}")
+        try:
+            CalibrationRequest(free=tuple(self.free), priors=self.stated_priors)
+        except TwinError as error:
+            raise ValueError(f"priors: {error.message}") from None
         return self
+
+    @property
+    def stated_priors(self) -> Mapping[str, float]:
+        """The priors that take the place of the assumed ones; 0 is exactly known."""
+        return exact(self.free) if self.priors == "none" else self.priors or {}
 
 
 class Plan(_Table):

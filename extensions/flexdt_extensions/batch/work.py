@@ -29,6 +29,7 @@ from flexdt.library.scan_limits import (
 from flexdt.phantoms import Phantom, bead_phantom, load_phantom, material, stated_keV
 from flexdt.phantoms.channels import chain_through, channels, line_integrals
 from flexdt.twin.calibration import FitResult, bead_model, estimate_geometry
+from flexdt.twin.calibration.fit.priors import known
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
@@ -398,8 +399,9 @@ def _calibrations(plan: Plan, item: Item) -> tuple[dict[str, Array], dict[str, A
         rng = np.random.default_rng(seed_of(plan, item.index, NOISE))
         noisy = tracks + item.noise_px * rng.normal(size=tracks.shape)
         fit = estimate_geometry(
-            noisy, model, item.poses, free, shape=item.shape, noise_px=item.noise_px
-        )
+            noisy, model, item.poses, free, shape=item.shape, noise_px=item.noise_px,
+            priors=known(free, plan.calibrate.priors),
+        )  # fmt: skip
         return {}, _judged(fit, item, free, fit.identifiable, "")
     from flexdt.twin.calibration.pipeline import CalibrationRequest, Scan, calibrate
     from flexdt_extensions.studies.rendered_runs import Rendering, render
@@ -407,9 +409,8 @@ def _calibrations(plan: Plan, item: Item) -> tuple[dict[str, Array], dict[str, A
     camera = Rendering(counts=item.counts, blur_px=plan.calibrate.blur_px)
     key = [int(v) for v in seed_of(plan, item.index, NOISE).generate_state(4)]
     frames = render(item.phantom.scene, model, item.poses, item.truth, camera, key, item.shape)
-    result = calibrate(
-        [Scan(frames, item.poses)], model, CalibrationRequest(free=free), scene=item.phantom.scene
-    )
+    request = CalibrationRequest(free=free, priors=plan.calibrate.stated_priors)
+    result = calibrate([Scan(frames, item.poses)], model, request, scene=item.phantom.scene)
     note = "; ".join(f.text for f in result.errors)
     return {}, _judged(result.fit, item, free, result.identifiable, note)
 

@@ -290,6 +290,36 @@ def test_calibrations_err_as_much_as_they_say() -> None:
             assert set(record["errors"].values()) == {None}
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("priors", [None, "none", {"dD_x": 0.1}])
+def test_points_and_images_state_the_same_sigmas(priors: Any) -> None:
+    """One model of what is known: only the noise of positions differs."""
+    document = json.loads(read_plan(EXAMPLES / "calibrations.toml").text)
+    document["calibrate"] |= {"priors": priors, "noise_px": 0.005}
+    document["geometry"]["frames"] = 12
+    document["phantom"] = {"name": "normal-5"}
+    sigmas = []
+    for fidelity in ("points", "images"):
+        document["calibrate"]["fidelity"] = fidelity
+        sigmas.append(run_item(parse_plan(document).text, 0).record["sigmas"])
+    for name in ("dO_x", "dO_y", "dO_z", "alpha"):
+        assert sigmas[0][name] == pytest.approx(sigmas[1][name], rel=0.25), name
+    assert (sigmas[0]["dO_x"] > 0.01) == (priors != "none")
+
+
+def test_priors_of_a_plan_are_checked() -> None:
+    document = json.loads(read_plan(EXAMPLES / "calibrations.toml").text)
+    for priors, said in (
+        ({"dO_w": 1.0}, "unknown parameter 'dO_w'"),
+        ({"dO_x": 0.0}, "dO_x is free, and its prior is 0"),
+        ({"dD_x": -1.0}, "calibrate.priors"),
+        ("some", "calibrate.priors"),
+    ):
+        document["calibrate"]["priors"] = priors
+        with pytest.raises(CommandError, match=said):
+            parse_plan(document)
+
+
 def test_figures_of_calibrations_are_those_of_its_items() -> None:
     def item(error: float | None) -> dict[str, Any]:
         sigma = None if error is None else 0.5
@@ -312,7 +342,6 @@ def test_calibrations_from_images() -> None:
     record = run_item(parse_plan(document).text, 0).record
     assert record["status"] == "done"
     assert record["identifiable"], record
-    # A plan states no priors for its panel: shifts are known as that allows, turns by the images.
     errors = {name: abs(error) for name, error in record["errors"].items()}
     assert all(error < 3.0 * record["sigmas"][name] for name, error in errors.items())
     assert max(errors["alpha"], errors["tau_x"], errors["tau_z"]) < 0.02

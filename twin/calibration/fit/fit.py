@@ -73,6 +73,9 @@ of that image against the detector's columns, positive where its upper end leans
 magnification: of a short line parallel to the detector's rows, on the axis at the object's
 reference height."""
 
+SLOPE_STEP: Final = 1e-4
+"""Step [mm, deg, 1] of the differences that give their derivatives."""
+
 
 @dataclass(frozen=True)
 class Solver:
@@ -529,20 +532,10 @@ def image_quantities(fit: FitResult) -> tuple[dict[str, Estimate], ...]:
     Returns:
         One dictionary for each group. Sigmas follow from the fit's covariance to first order.
     """
-    names = list(fit.certificate.estimates)
-    factor = np.array([edge_factor(n) for n in names])
-    x = fit.solution.x
     t = float(stdtrit(fit.certificate.dof, 0.975))
     out = []
     for group in range(len(fit.group_parameters)):
-        here = _axis_at(fit, x, group)
-        slopes = []
-        for i in range(len(names)):
-            step = np.zeros_like(x)
-            step[i] = 1e-4 / factor[i]
-            ends = _axis_at(fit, x + step, group), _axis_at(fit, x - step, group)
-            slopes.append((ends[0] - ends[1]) / 2e-4)
-        rows = np.array(slopes).T
+        here, rows = image_slopes(fit.problem, fit.solution.x, group)
         sigma = np.sqrt(np.maximum(np.einsum("qi,ij,qj->q", rows, fit.covariance, rows), 0.0))
         out.append(
             {
@@ -555,8 +548,29 @@ def image_quantities(fit: FitResult) -> tuple[dict[str, Estimate], ...]:
     return tuple(out)
 
 
-def _axis_at(fit: FitResult, x: FloatArray, group: int) -> FloatArray:
-    problem = fit.problem
+def image_slopes(problem: FitProblem, x: FloatArray, group: int) -> tuple[FloatArray, FloatArray]:
+    """The quantities IN_IMAGES describes, and how they follow the parameters.
+
+    Args:
+        problem: the data.
+        x: column values, internal units.
+        group: of frames.
+
+    Returns:
+        Values (3,) in the group's first frame, and derivatives (3, p) by the columns that are
+        parameters, edge units.
+    """
+    names = problem.layout.names[: problem.layout.parameter_count]
+    slopes = []
+    for i, name in enumerate(names):
+        step = np.zeros_like(x)
+        step[i] = SLOPE_STEP / edge_factor(name)
+        ends = _axis_at(problem, x + step, group), _axis_at(problem, x - step, group)
+        slopes.append((ends[0] - ends[1]) / (2.0 * SLOPE_STEP))
+    return _axis_at(problem, x, group), np.array(slopes).T
+
+
+def _axis_at(problem: FitProblem, x: FloatArray, group: int) -> FloatArray:
     frame = int(np.flatnonzero(problem.group == group)[0])
     offsets = problem.parameters(x)[group]
     return axis_in_image(problem.poses[frame : frame + 1], offsets, problem.origin[frame])

@@ -6,7 +6,8 @@ suggestions are planned scans as well and are evaluated in the same way.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,9 +15,11 @@ import numpy.typing as npt
 
 from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model, spot_radii
 from flexdt.twin.calibration.fit.certificate import Conditioning, spectrum
-from flexdt.twin.calibration.fit.priors import require_widths
+from flexdt.twin.calibration.fit.fit import IN_IMAGES, image_slopes
+from flexdt.twin.calibration.fit.priors import NOISE_PX, Given, known
 from flexdt.twin.calibration.fit.problem import (
     SIX,
+    FitProblem,
     Shape,
     as_poses,
     build_problem,
@@ -55,6 +58,7 @@ class Prediction:
 
     Attributes:
         sigmas: column -> predicted standard deviation, edge units; inf where not determined.
+        image_sigmas: the same of what a reconstruction feels: IN_IMAGES of `fit.fit`.
         covariance: (p, p) edge units.
         rank, condition: of the column-scaled Jacobian.
         null, weak: directions not determined, or badly.
@@ -63,6 +67,7 @@ class Prediction:
     """
 
     sigmas: dict[str, float]
+    image_sigmas: dict[str, float]
     covariance: FloatArray
     rank: int
     condition: float
@@ -85,13 +90,13 @@ class Prediction:
 def identifiability(
     phantom: BeadPhantom | BeadModel | npt.ArrayLike,
     geometry: Poses | ConeVec,
-    noise_px: float = 0.1,
+    noise_px: float = NOISE_PX,
     free: Sequence[str] = SIX,
     *,
     shape: Shape = None,
     at: Offsets = NOMINAL,
     bead_tolerance_mm: float = 0.0,
-    priors: Mapping[str, float] | None = None,
+    priors: Given | None = None,
     bound: float = BOUND,
 ) -> Prediction:
     """Predict the uncertainty of a calibration, and what changes to the plan would make of it.
@@ -105,7 +110,9 @@ def identifiability(
             lie wholly on it do not count.
         at: the geometry to predict at.
         bead_tolerance_mm: > 0: bead positions are unknowns with this prior.
-        priors, bound: as for `estimate_geometry`.
+        priors: what is known of other offsets [mm, deg, 1], in place of what `flexdt calibrate`
+            assumes of a scanner that states nothing; 0 is exactly, "none" is all exactly.
+        bound: sigma [mm, deg] beyond which a direction counts as not determined.
 
     Returns:
         Predicted sigmas, rank, directions not determined, and suggestions.
@@ -130,9 +137,11 @@ def identifiability(
     model = bead_model(phantom)
     poses = as_poses(geometry)
 
+    widths = known(free, priors)
+
     def predict(
         beads: BeadModel, plan: Poses, sizes: FloatArray
-    ) -> tuple[Conditioning, dict[str, float], FloatArray, npt.NDArray[np.bool_]]:
+    ) -> tuple[Forecast, npt.NDArray[np.bool_]]:
         visible = visible_beads(beads, plan, sizes, at)
         pixels = plan.cone_vec(at).project_points(beads.beads, (1, 1))
         origin = (sizes[:, ::-1] - 1) / 2
@@ -140,30 +149,26 @@ def identifiability(
         problem = build_problem(
             tracks, beads, plan, free=free, shape=sizes, noise_px=noise_px,
             free_beads=bead_tolerance_mm > 0, start=at, bead_tolerance_mm=bead_tolerance_mm,
-            priors=require_widths(priors or {}),
+            priors=widths,
         )  # fmt: skip
-        rows = np.concatenate([problem.jacobian(problem.start), np.diag(1.0 / problem.prior_sigma)])
-        names, count = problem.layout.names, problem.layout.asked
-        seen = int(visible.any(axis=0).sum())
-        spec = spectrum(rows, names, seen, reported=count, bound=bound)
-        covariance = spec.unit_covariance[:count, :count]
-        sigmas = dict(zip(names[:count], np.sqrt(np.diag(covariance)).tolist(), strict=True))
-        return spec, sigmas, covariance, visible
+        return forecast(problem, bound), visible
 
     sizes = frame_shapes(shape, len(poses))
-    spec, sigmas, covariance, visible = predict(model, poses, sizes)
+    told, visible = predict(model, poses, sizes)
+    spec, sigmas = told.spectrum, told.sigmas
     suggestions: list[Suggestion] = []
     before = _worst(sigmas)
     if spec.null or spec.weak or before > 1.0:
         for change, plan in _changes(model, poses, sizes).items():
-            after = predict(*plan)[1]
+            after = predict(*plan)[0].sigmas
             worst = _worst(after)
             if worst < before * 0.8 or (not np.isfinite(before) and np.isfinite(worst)):
                 suggestions.append(Suggestion(change, worst, before / worst, after))
         suggestions.sort(key=lambda s: s.worst)
     return Prediction(
         sigmas=sigmas,
-        covariance=covariance,
+        image_sigmas=told.image_sigmas,
+        covariance=told.covariance,
         rank=spec.rank,
         condition=spec.condition,
         null=spec.null,
@@ -171,6 +176,53 @@ def identifiability(
         visible=visible,
         suggestions=tuple(suggestions),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Forecast:
+    """What the data of a problem would tell, with its priors.
+
+    Attributes:
+        sigmas: of what was asked for -> standard deviation, edge units; inf: not determined.
+        image_sigmas: of IN_IMAGES.
+        covariance: (p, p) of what was asked for, edge units.
+        spectrum: rank, condition, null and weak directions of what was asked for.
+    """
+
+    sigmas: dict[str, float]
+    image_sigmas: dict[str, float]
+    covariance: FloatArray
+    spectrum: Conditioning
+
+
+def forecast(problem: FitProblem, bound: float = BOUND) -> Forecast:
+    """Predict the certificate of a fit to the data of a problem, at its start.
+
+    Args:
+        problem: the planned data, with priors.
+        bound: as of `identifiability`.
+    """
+    names, count = problem.layout.names, problem.layout.asked
+    reported = problem.layout.parameter_count
+    seen = int(problem.seen.any(axis=0).sum())
+    rows = np.concatenate([problem.jacobian(problem.start), np.diag(1.0 / problem.prior_sigma)])
+    spec = spectrum(rows, names, seen, reported=count, bound=bound)
+    if count < reported:
+        # Rank and condition say what the images tell of what was asked for, all else given.
+        given = [i for i in range(len(names)) if not count <= i < reported]
+        alone = spectrum(rows[:, given], [names[i] for i in given], seen, reported=count)
+        rank = min(alone.rank, len(given) - len(spec.null))
+        unit = spec.unit_covariance
+        spec = replace(alone, unit_covariance=unit, rank=rank, null=spec.null)
+    covariance = spec.unit_covariance[:count, :count]
+    sigmas = dict(zip(names[:count], np.sqrt(np.diag(covariance)).tolist(), strict=True))
+    images = dict.fromkeys(IN_IMAGES, math.inf)
+    whole = spec.unit_covariance[:reported, :reported]
+    if np.isfinite(whole).all():
+        slopes = image_slopes(problem, problem.start, 0)[1]
+        variance = np.einsum("qi,ij,qj->q", slopes, whole, slopes)
+        images = dict(zip(IN_IMAGES, np.sqrt(np.maximum(variance, 0.0)).tolist(), strict=True))
+    return Forecast(sigmas, images, covariance, spec)
 
 
 def visible_beads(

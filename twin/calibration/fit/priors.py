@@ -3,13 +3,15 @@
 An offset that is not estimated is not known exactly. Its prior enters the estimate and every sigma
 (`docs/calibration.md`, "Priors"). The widths here are for a scanner of which nothing better is
 known; machine files and profiles have their own in a table `priors`.
+
+`known` is the one model: calibrations, forecasts, designs of phantoms and batches ask it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Mapping
-from typing import Final
+from collections.abc import Container, Iterable, Mapping
+from typing import Final, Literal
 
 from flexdt.twin.calibration.fit.problem import SIX, require_names
 from flexdt.twin.errors import TwinError
@@ -26,6 +28,41 @@ closes on itself; wrong steps are looked for by themselves)."""
 FIXED: Final[Mapping[str, float]] = dict.fromkeys(SIX, 0.3)
 """The same for what the operator chooses, where it is not to be estimated: read from motors and a
 mount, it is not exact either."""
+
+NOISE_PX: Final = 0.1
+"""Standard deviation of a detected coordinate in forecasts, assumed: images of a good exposure tell
+it twenty times better, which priors hide in the offsets and which shows in the image."""
+Given = Mapping[str, float] | Literal["none"]
+"""Widths that a user states in place of others [mm, deg, 1]; none: all is exactly known."""
+
+
+def known(
+    free: Container[str] = SIX,
+    given: Given | None = None,
+    scanners: Iterable[Mapping[str, float]] = (ASSUMED,),
+) -> dict[str, float]:
+    """Give what is known of every offset before its images are seen: standard deviations.
+
+    Args:
+        free: parameters that are estimated; only a user's own statement is a prior of these.
+        given: what a user states; None: nothing.
+        scanners: widths of the scanners, of which the widest counts.
+
+    Returns:
+        Parameter -> standard deviation [mm, deg, 1]; 0 is exactly known.
+
+    >>> known()["dD_z"], known(given={"dD_z": 0.05})["dD_z"], known(given="none")["dD_z"]
+    (1.0, 0.05, 0.0)
+    """
+    if given == "none":
+        return exact(free)
+    out = {name: width for name, width in FIXED.items() if name not in free}
+    for widths in scanners:
+        for name, width in widths.items():
+            if name not in free:
+                out[name] = max(out.get(name, 0.0), width)
+    own = require_widths(given or {})
+    return out | {n: w for n, w in own.items() if w > 0 or n not in free}
 
 
 def exact(free: Container[str] = SIX) -> dict[str, float]:

@@ -1,0 +1,69 @@
+"""A forecast is what the certificate of the scan then states, of points and of images."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import numpy.typing as npt
+import prior_coverage as own
+import pytest
+
+from flexdt.phantoms import load_phantom, spiral_positions
+from flexdt.twin.calibration import SIX, BeadModel, FitResult, estimate_geometry, identifiability
+from flexdt.twin.calibration.fit.fit import image_quantities
+from flexdt.twin.calibration.fit.priors import Given, exact, known
+from flexdt.twin.calibration.frame_source import ArrayFrames
+from flexdt.twin.calibration.pipeline import CalibrationRequest, Scan, calibrate
+from flexdt.twin.geometry.poses import Poses
+
+FRAMES = 36
+ANGLES = 360.0 * np.arange(FRAMES) / FRAMES
+POSES = Poses.upright([0, 0, 0], [0, own.SOD, 0], [0, own.SDD, 0], own.PIXEL, np.radians(ANGLES))
+TRUTH = {"dO_x": 1.0, "dO_y": -2.0, "dO_z": 3.0, "alpha": 17.0, "tau_x": 0.4, "tau_z": -0.3}
+AGREE = 0.2
+STATED: tuple[Given | None, ...] = (None, {"dD_x": 0.1, "dD_y": 0.1}, "none")
+
+
+@cache
+def beads_of(kind: str) -> npt.NDArray[np.float64]:
+    if kind == "spiral":
+        return spiral_positions((20.0, 40.0, 50.0), 5, own.RADIUS)
+    if kind == "lego":
+        return np.asarray(load_phantom("lego").beads)
+    return own.spread(np.random.default_rng([5, *kind.encode()]), 4 * own.RADIUS)
+
+
+def assert_as_forecast(fit: FitResult, model: BeadModel, priors: Given | None) -> None:
+    forecast = identifiability(model, POSES, fit.certificate.rms_px, shape=own.SHAPE, priors=priors)
+    for name in SIX:
+        assert forecast.sigmas[name] == pytest.approx(fit.sigmas[name], rel=AGREE), name
+    (seen,) = image_quantities(fit)
+    for name, estimate in seen.items():
+        assert forecast.image_sigmas[name] == pytest.approx(estimate.sigma, rel=AGREE), name
+
+
+@pytest.mark.parametrize("priors", STATED)
+@pytest.mark.parametrize("kind", ["spiral", "lego", "random 1", "random 2"])
+def test_points(kind: str, priors: Given | None) -> None:
+    beads = beads_of(kind)
+    rng = np.random.default_rng([3, *kind.encode()])
+    tracks = own.pixels(beads, ANGLES, own.SOD, TRUTH)
+    tracks = tracks + rng.normal(0, own.NOISE_PX, tracks.shape)
+    model = BeadModel(beads, np.full(len(beads), own.RADIUS))
+    fit = estimate_geometry(tracks, model, POSES, shape=own.SHAPE, priors=known(given=priors))
+    assert_as_forecast(fit, model, priors)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("priors", [None, "none"])
+@pytest.mark.parametrize("kind", ["spiral", "random 1"])
+def test_images(kind: str, priors: Given | None) -> None:
+    beads = beads_of(kind)
+    images = own.radiographs(np.random.default_rng(4), beads, ANGLES, own.SOD, TRUTH)
+    model = BeadModel(beads, np.full(len(beads), own.RADIUS))
+    request = CalibrationRequest(priors=exact() if priors == "none" else {})
+    found = calibrate([Scan(ArrayFrames(images, own.SHAPE), POSES)], model, request)
+    assert found.identifiable, found.findings
+    assert found.fit is not None
+    assert_as_forecast(found.fit, model, priors)
