@@ -79,11 +79,11 @@ def test_flats_that_disagree_are_said(integrals, flats):
 
 
 @pytest.mark.parametrize(
-    "beam", [1.1, 0.9, np.linspace(1.0, 0.8, 60), np.linspace(0.9, 1.1, 60)], ids=str
+    "beam", [1.1, 1.5, np.linspace(1.0, 0.8, 60), np.linspace(0.9, 1.1, 60)], ids=str
 )
 def test_a_beam_that_is_not_the_flats_is_said(integrals, beam):
     doubts = image_doubts(exposed(integrals, (1,), beam))
-    assert any("images' edges are" in doubt for doubt in doubts)
+    assert any("open beam beside the object" in doubt for doubt in doubts)
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -98,7 +98,7 @@ def test_objects_wider_than_the_panel_are_no_other_beam(radius, mu):
     _, y, x = (c for c in np.meshgrid(*wide.blank().centers()[::-1], indexing="ij"))
     body = fx.Volume((mu * (np.hypot(x, y) < radius)).astype(np.float32), wide.voxel_mm)
     doubts = image_doubts(exposed(fx.project(body, SCAN), (1,)))
-    assert all("reaches beyond both edges" in doubt for doubt in doubts if "edges are" in doubt)
+    assert not any("open beam" in doubt for doubt in doubts)
 
 
 def test_images_that_hold_nothing_are_said(integrals):

@@ -20,6 +20,8 @@ from flexdt.twin.exchange import geometry as g
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
 from flexdt.twin.exchange.number_tables import cone_vec_of
 from flexdt.twin.geometry.conventions import FloatArray, rotation_x, rotation_y, rotation_z
+from flexdt.twin.plausibility import settled
+from flexdt.twin.plausibility.scan_geometry import distance_findings
 
 VERSION: Final = "0.1.0"
 ROUNDED_MM: Final = 1e-4
@@ -141,6 +143,8 @@ def read_flexdata(
     sod, odd = (sdd - odd if math.isnan(sod) else sod), (sdd - sod if math.isnan(odd) else odd)
     if math.isnan(sod) or math.isnan(odd):
         raise ExchangeError(f"{file}: two of src2obj, det2obj and src2det are needed")
+    given = distance_findings(sod, sod + odd, found["det_pixel"], ("src2obj", "src2det"))
+    settled(given, ExchangeError, file)
     roll, yaw, pitch = (math.radians(found[f"det_{name}"]) for name in ("roll", "yaw", "pitch"))
     axes = rotation_y(roll) @ rotation_z(yaw) @ rotation_x(pitch)
     axis, moved, sample = found["axs_tan"], found["vol_tra"], found["det_sample"]

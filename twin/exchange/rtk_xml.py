@@ -18,9 +18,13 @@ import numpy as np
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry, require_panel
 from flexdt.twin.exchange.number_tables import cone_vec_of
 from flexdt.twin.geometry.conventions import FloatArray, rotation_x, rotation_y, rotation_z
+from flexdt.twin.plausibility import settled
+from flexdt.twin.plausibility.scan_geometry import distance_findings
 
 TO_RTK: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """Our (x, y, z) to RTK's; a turn, no mirror."""
+SAME: Final = 1e-9
+"""Relative difference of distances that rounding makes."""
 VERSION: Final = "3"
 NAMES: Final = ("GantryAngle", "OutOfPlaneAngle", "InPlaneAngle", "SourceToIsocenterDistance",
                 "SourceToDetectorDistance", "SourceOffsetX", "SourceOffsetY", "ProjectionOffsetX",
@@ -117,6 +121,7 @@ def read_rtk(
         raise ExchangeError.instead(said, root.tag, f"{_ROOT} version {VERSION}")
     common = dict.fromkeys(NAMES, 0.0)  # what RTK writes before the views holds for all
     rows: list[FloatArray] = []
+    stated: list[tuple[float, float]] = []
     for element in root:
         if element.tag == "Projection":
             values = dict(common)
@@ -126,9 +131,29 @@ def read_rtk(
                 said = f"{file}: view {len(rows)} is parallel (no source-detector distance)"
                 raise ExchangeError.instead(said, 0.0, "a cone beam", row=len(rows))
             rows.append(row_of(tuple(values[n] for n in NAMES), pitch_mm))
+            stated.append((values["SourceToIsocenterDistance"], values["SourceToDetectorDistance"]))
         else:
             _take(element, common, file)
+    _require_distances(stated, file)
     return ScanGeometry(cone_vec_of(rows, file), shape)
+
+
+def _require_distances(stated: list[tuple[float, float]], file: str) -> None:
+    """Check the distances of source to isocentre and to detector, as the file has them.
+
+    Negative ones are those of a panel whose rows grow downwards.
+
+    Raises:
+        ExchangeError: those of all views are such as no scanner has.
+    """
+    if not stated:
+        return
+    pairs = np.array(stated)
+    sod, sdd = np.abs(pairs).T
+    if ((sod == 0.0) | (sod > sdd * (1 + SAME))).all():
+        names = ("SourceToIsocenterDistance", "SourceToDetectorDistance")
+        impossible = distance_findings(float(sod[0]), float(sdd[0]), 0.1 * sdd[0], names)
+        settled(impossible, ExchangeError, file)
 
 
 def row_of(values: tuple[float, ...], pitch_mm: tuple[float, float]) -> FloatArray:

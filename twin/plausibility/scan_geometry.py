@@ -91,6 +91,11 @@ def geometry_findings(cone_vec: ConeVec, shape: tuple[int, int] | None) -> Itera
         figure = float(pitch[worst] / max(distance[worst], 1e-300))
         yield Finding("impossible distances", cause, allowed, Severity.REFUSAL, figure)
         return
+    if _still_source(cone_vec, distance):
+        cause = "the source stands still while the panel turns about it: SOD is 0"
+        allowed = "allowed: a source before the axis"
+        yield Finding("impossible distances", cause, allowed, Severity.REFUSAL, 0.0)
+        return
     if shape is None:
         return
     ends = cone_vec[:: -(-len(cone_vec) // SOME_VIEWS)].rays(shape)
@@ -107,6 +112,15 @@ def geometry_findings(cone_vec: ConeVec, shape: tuple[int, int] | None) -> Itera
             f"{pitch.max():.3g} mm at {distance.min():.4g} mm"
         )
         yield Finding("units", cause, "are all lengths in mm?", Severity.WARNING, fan)
+
+
+def _still_source(cone_vec: ConeVec, distance: FloatArray) -> bool:
+    """Whether all views have one source and beams all around it."""
+    if len(cone_vec) < 3 or float(np.ptp(cone_vec.source, axis=0).max()) > 1e-9 * distance.max():
+        return False
+    beam = cone_vec.detector - cone_vec.source
+    unit = beam / np.linalg.norm(beam, axis=1, keepdims=True)
+    return bool((unit @ unit[0]).min() < -0.5)
 
 
 def radian_findings(angles: npt.ArrayLike) -> Iterator[Finding]:
@@ -145,19 +159,19 @@ def _round_degrees(span: float, step: float) -> bool:
 
 def arc_deg(cone_vec: ConeVec) -> float:
     """The angle that the views of a circular scan run through [deg]."""
-    azimuth = _azimuths(cone_vec)
+    azimuth = azimuths(cone_vec)
     at = np.sort(azimuth % math.tau)
     gaps = np.diff(at, append=at[0] + math.tau)
     return float(np.rad2deg(math.tau - gaps.max()))
 
 
-def _azimuths(cone_vec: ConeVec) -> FloatArray:
+def azimuths(cone_vec: ConeVec) -> FloatArray:
     """Of each view's beam about z, (n,) [rad]."""
     beam = cone_vec.detector - cone_vec.source
     return np.asarray(np.arctan2(beam[:, 1], beam[:, 0]))
 
 
-def _about_z(cone_vec: ConeVec) -> bool:
+def about_z(cone_vec: ConeVec) -> bool:
     """Whether the views turn about z at one inclination, as those of a circle or helix do."""
     beam = cone_vec.detector - cone_vec.source
     level = np.hypot(beam[:, 0], beam[:, 1])
@@ -168,7 +182,7 @@ def _about_z(cone_vec: ConeVec) -> bool:
 
 def span_findings(cone_vec: ConeVec) -> Iterator[Finding]:
     """Find radians given as degrees: many views within a few degrees."""
-    if len(cone_vec) < RADIANS_VIEWS or not _about_z(cone_vec):
+    if len(cone_vec) < RADIANS_VIEWS or not about_z(cone_vec):
         return
     span = arc_deg(cone_vec)
     if 0.0 < span < RADIANS_SPAN:
@@ -179,9 +193,9 @@ def span_findings(cone_vec: ConeVec) -> Iterator[Finding]:
 
 def arc_findings(cone_vec: ConeVec) -> Iterator[Finding]:
     """Find directions that no view has, for a method that takes any trajectory."""
-    if len(cone_vec) < 3 or not _about_z(cone_vec):
+    if len(cone_vec) < 3 or not about_z(cone_vec):
         return
-    at = np.unique((_azimuths(cone_vec) % math.pi).round(6) % round(math.pi, 6))
+    at = np.unique((azimuths(cone_vec) % math.pi).round(6) % round(math.pi, 6))
     if len(at) < 3:
         return
     gaps = np.rad2deg(np.diff(at, append=at[0] + math.pi))
@@ -209,7 +223,7 @@ def inclination_findings(cone_vec: ConeVec, centre: npt.ArrayLike) -> Iterator[F
     """
     if (
         len(cone_vec) < 3
-        or not _about_z(cone_vec)
+        or not about_z(cone_vec)
         or np.ptp(cone_vec.source[:, 2]) > 1e-3 * (np.abs(cone_vec.source_detector_distance).max())
     ):
         return

@@ -30,6 +30,7 @@ from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
 from flexdt.twin.exchange.number_tables import geometry_text, read_geometry_text, read_vectors_array
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.plausibility import Operation, examine, settled
 from flexdt.twin.signatures import File
 
 __all__ = [
@@ -171,7 +172,18 @@ def import_geometry(
             raise ExchangeError(said, {"asked": asked, "allowed": found})
     known.check_pitch(geometry, path)
     shape = known.shape if geometry.shape is None else geometry.shape
-    return replace(geometry, shape=shape, name=geometry.name or path.stem)
+    return _examined(replace(geometry, shape=shape, name=geometry.name or path.stem), path)
+
+
+def _examined(geometry: ScanGeometry, path: Path) -> ScanGeometry:
+    """The geometry of a file with what is doubtful about it among its notes.
+
+    Raises:
+        ExchangeError: no scanner has it.
+    """
+    found = examine(Operation.OPEN, geometry.cone_vec, geometry.shape)
+    doubts = settled(found, ExchangeError, str(path))
+    return replace(geometry, notes=(*geometry.notes, *doubts)) if doubts else geometry
 
 
 def _known(format: str, allowed: Iterable[str]) -> Format:
@@ -232,8 +244,10 @@ def load_geometry(path: str | PathLike[str]) -> ScanGeometry:
     """
     file = Path(path)
     if file.suffix.lower() == NPY:
-        return ScanGeometry(read_vectors_array(arrays_of(file)["array"], str(file)))
-    return read_geometry_text(text_of(file), str(file))
+        geometry = ScanGeometry(read_vectors_array(arrays_of(file)["array"], str(file)))
+    else:
+        geometry = read_geometry_text(text_of(file), str(file))
+    return _examined(geometry, file)
 
 
 def with_geometry(dataset: Images, geometry: ScanGeometry | ConeVec | File) -> Images:

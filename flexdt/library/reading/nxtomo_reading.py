@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
 
 from flexdt.library.data_set import DataSet
 from flexdt.library.datasets.nxtomo_writing import DARK, FLAT, INVALID, PROJECTION
 from flexdt.library.extras import package
+from flexdt.library.reading.foreign_parsing import require_memory
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.length_units import UNITS_MM
+from flexdt.twin.plausibility import Finding, settled
+from flexdt.twin.plausibility.stated_figures import angle_findings, pixel_findings
+
+KNOWN: Final = (PROJECTION, FLAT, DARK, INVALID)
+MOST_DEFLATED: Final = 2000
+"""Bytes of images for each byte of the file; of zeros alone there are more."""
+SMALL_BYTES: Final = 1 << 30
+"""Images of which it does not matter how far they were deflated."""
 
 
 def read_nxtomo(path: Path, geometry: ConeVec | None) -> DataSet:
@@ -21,37 +36,159 @@ def read_nxtomo(path: Path, geometry: ConeVec | None) -> DataSet:
         geometry: one view for each projection; None: the rows of cone_vec in the file.
 
     Raises:
-        DatasetFormatError: no HDF5, no NXtomo, or no geometry.
+        DatasetFormatError: no HDF5, no NXtomo, images that are not there, or no geometry.
     """
     h5py = package("h5py", "NXtomo")
     try:
         with h5py.File(path) as file:
-            found: list[Any] = []
-            file.visititems(
-                lambda _, item: found.append(item) if "image_key" in getattr(item, "keys", set)()
-                and "data" in item else None
-            )  # fmt: skip
-            if not found:
-                raise DatasetFormatError(
-                    f"{path}: no group has data and image_key; allowed: NXtomo", {"path": str(path)}
-                )
-            images, keys = found[0]["data"][:], found[0]["image_key"][:]
-            rows = [item[:] for name, item in file.items() if name == "cone_vec"] or [
-                entry["flexdt/cone_vec"][:] for entry in file.values() if "flexdt/cone_vec" in entry
-            ]
+            return _read(file, path, geometry)
     except OSError as error:
         raise DatasetFormatError(f"{path} is no HDF5 file: {error}", {"path": str(path)}) from None
-    if geometry is None:
-        if not rows:
-            raise DatasetFormatError(
-                f"{path}: NXtomo says no geometry of a cone beam; give it: geometry=ConeVec",
-                {"missing": "geometry"},
-            )
-        geometry = ConeVec(rows[0])
-    several = [images[keys == key] if (keys == key).any() else None for key in (DARK, FLAT)]
+
+
+def _read(file: Any, path: Path, geometry: ConeVec | None) -> DataSet:
+    name, doubts = _entry(file, path)
+    group = file[name]
+    data, keys = _images_of(group, path)
     lost = int((keys == INVALID).sum())
-    data = DataSet.from_arrays(
-        images[keys == PROJECTION], geometry, dark=several[0], flat=several[1], name=path.stem
+    if lost:
+        doubts.append(f"{lost} images are marked as invalid and left out")
+    others = sorted(set(keys.tolist()) - set(KNOWN))
+    if others:
+        many = int(np.isin(keys, others).sum())
+        doubts.append(f"{many} images of the keys {', '.join(map(str, others))} are left out")
+    images = data[:]
+    several = [images[keys == key] if (keys == key).any() else None for key in (DARK, FLAT)]
+    projections = keys == PROJECTION
+    if not projections.any():
+        raise DatasetFormatError(f"{path}: no image has the key of a projection, {PROJECTION}",
+                                 {"path": str(path)})  # fmt: skip
+    given = _geometry(file, name, path) if geometry is None else geometry
+    made = DataSet.from_arrays(
+        images[projections], given, dark=several[0], flat=several[1], name=path.stem
     )
-    doubts = [f"{lost} images are marked as invalid and left out"] if lost else []
-    return replace(data, warnings=(*data.warnings, *doubts))
+    doubts += settled(_stated(file, name, given, projections), DatasetFormatError, path.name)
+    return replace(made, warnings=(*made.warnings, *doubts))
+
+
+def _entry(file: Any, path: Path) -> tuple[str, list[str]]:
+    """The name of the group that holds images and their keys, and what is doubtful about it.
+
+    Raises:
+        DatasetFormatError: there is none, or its images are a link that leads nowhere.
+    """
+    found: list[str] = []
+    lost: list[str] = []
+
+    def look(name: str, item: Any) -> None:
+        if "image_key" not in getattr(item, "keys", tuple)():
+            return
+        for part in ("data", "image_key"):
+            link = item.get(part, getlink=True) if part in item.keys() else None  # noqa: SIM118
+            if link is not None and item.get(part) is None:
+                target = getattr(link, "filename", "") or getattr(link, "path", "")
+                lost.append(f"{name}/{part} is a link to {target}, which is not there")
+        if item.get("data") is not None and item.get("image_key") is not None:
+            found.append(name)
+
+    file.visititems(look)
+    if not found:
+        why = lost[0] if lost else "no group has data and image_key; allowed: NXtomo"
+        raise DatasetFormatError(f"{path}: {why}", {"path": str(path)})
+    entries = list(dict.fromkeys(name.split("/")[0] for name in found))
+    told = []
+    if len(entries) > 1:
+        more = ", ".join(entries[1:6])
+        told.append(f"{path.name} holds {len(entries)} scans: {entries[0]} is read, not {more}")
+    return found[0], told
+
+
+def _images_of(group: Any, path: Path) -> tuple[Any, npt.NDArray[Any]]:
+    """The images, not yet read, and their keys.
+
+    Raises:
+        DatasetFormatError: they do not fit each other, are not there, or fit no memory.
+    """
+    data, keys = group["data"], np.asarray(group["image_key"])
+    if data.ndim != 3 or keys.ndim != 1:
+        said = f"{path}: data of shape {data.shape}, image_key {keys.shape}"
+        raise DatasetFormatError.instead(said, list(data.shape), "(n, rows, cols) and (n,)")
+    if len(keys) != len(data):
+        turned = " (sinograms? give them as images)" if len(keys) in data.shape else ""
+        said = f"{path}: {len(data)} images and {len(keys)} image keys{turned}"
+        raise DatasetFormatError.instead(said, len(keys), f"one for each of {len(data)} images")
+    size, held = data.size * data.dtype.itemsize, path.stat().st_size
+    gone = [name for name in _sources(data) if not (path.parent / name).exists()]
+    if gone:
+        said = f"{path}: its images lie in {', '.join(gone[:3])}, which is not there"
+        raise DatasetFormatError(said, {"path": str(path), "missing": gone[:100]})
+    require_memory(path, "images", size)
+    if not data.is_virtual and not data.external:
+        stored = data.id.get_storage_size()
+        if not stored or size > max(SMALL_BYTES, MOST_DEFLATED * min(stored, held)):
+            said = f"{path} claims images of {size / 2**30:.4g} GiB and holds {stored} bytes"
+            raise DatasetFormatError.instead(said, size, "images that were recorded")
+    return data, keys
+
+
+def _sources(data: Any) -> Iterator[str]:
+    """The files in which the images lie, where it is not the one that says so."""
+    if data.is_virtual:
+        yield from dict.fromkeys(s.file_name for s in data.virtual_sources() if s.file_name != ".")
+    if data.external:
+        yield from dict.fromkeys(str(name) for name, *_ in data.external)
+
+
+def _geometry(file: Any, name: str, path: Path) -> ConeVec:
+    """The rows of cone_vec in the file.
+
+    Raises:
+        DatasetFormatError: there are none.
+    """
+    entry = file[name.split("/")[0]]
+    rows = next((g for g in (_member(file, "cone_vec"), _member(entry, "flexdt/cone_vec"))
+                 if g is not None), None)  # fmt: skip
+    if rows is None:
+        raise DatasetFormatError(
+            f"{path}: NXtomo says no geometry of a cone beam; give it: geometry=ConeVec",
+            {"missing": "geometry"},
+        )
+    return ConeVec(rows[:])
+
+
+def _member(group: Any, name: str) -> Any:
+    """A member of a group, where it is one; None else."""
+    return group.get(name) if hasattr(group, "get") else None
+
+
+def _stated(
+    file: Any, name: str, geometry: ConeVec, projections: npt.NDArray[np.bool_]
+) -> Iterator[Finding]:
+    """Compare the angles and the pixel that the file states with the geometry."""
+    entry, near = file[name.split("/")[0]], file[name]
+    places = (near, entry, *(one for one in entry.values() if hasattr(one, "get")))
+    for place in places:
+        for at in ("rotation_angle", "sample/rotation_angle"):
+            angles = _member(place, at)
+            if angles is not None and angles.shape == projections.shape:
+                unit = _unit(angles, "deg")
+                values = np.asarray(angles, dtype=np.float64)[projections]
+                turn = values if unit.startswith("rad") else values * (math.pi / 180)
+                yield from angle_findings(geometry, turn)
+                break
+        else:
+            continue
+        break
+    for place in (near, *(_member(p, "instrument/detector") for p in places)):
+        size = None if place is None else _member(place, "x_pixel_size")
+        if size is not None and size.size == 1:
+            scale = UNITS_MM.get(_unit(size, "m"))
+            if scale is not None:
+                yield from pixel_findings(geometry, float(np.ravel(size)[0]) * scale)
+            return
+
+
+def _unit(dataset: Any, usual: str) -> str:
+    """The unit that an attribute states, or the usual one."""
+    said = dataset.attrs.get("units", usual)
+    return said.decode() if isinstance(said, bytes) else str(said)

@@ -25,6 +25,8 @@ UPRIGHT = 1e-7
 FINER = 1.3
 """Columns of an upright panel for each of the tilted panel's, in FDK: resampled twice, before the
 filter and after it, edges would come out wider."""
+SMALL_MM = 0.01
+"""Voxels below this are not rounded to whole micrometres."""
 FLAT = 1e-3
 """Smallest horizontal part of a panel's normal that can be stood upright."""
 
@@ -119,7 +121,8 @@ def field_of_view(cone_vec: ConeVec, shape: tuple[int, int], voxel_mm: float | N
     Args:
         cone_vec: the scan.
         shape: detector (rows, cols).
-        voxel_mm: default: the pixel's size at the rotation axis, to 1 um.
+        voxel_mm: default: the pixel's size at the rotation axis, to 1 um, or to three digits where
+            it is below 10 um.
 
     Raises:
         GeometryError: the axis is not in front of the source, or no voxel is so large.
@@ -143,7 +146,8 @@ def field_of_view(cone_vec: ConeVec, shape: tuple[int, int], voxel_mm: float | N
         raise GeometryError("the object's origin is not in front of the source in every view")
     pitch = float(np.linalg.norm(cone_vec.u[0]))
     if voxel_mm is None:
-        voxel_mm = max(round(pitch * scale, 3), 1e-3)
+        size = pitch * scale
+        voxel_mm = round(size, 3) if size >= SMALL_MM else float(f"{size:.3g}")
     centre = cone_vec.project_points(np.zeros((1, 3)), shape)[:, 0]
     reach = float(np.abs(np.concatenate([centre[:, 0] + 0.5, cols - 0.5 - centre[:, 0]])).max())
     up = float((centre[:, 1] + 0.5).max()) * pitch * scale

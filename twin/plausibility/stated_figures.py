@@ -1,0 +1,107 @@
+"""What a file states of a scan, its angles and pixel, against the geometry that it is given."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from itertools import product
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.plausibility.findings import Finding, Severity
+from flexdt.twin.plausibility.scan_geometry import about_z, azimuths
+
+SAME_ANGLE_DEG: Final = 0.1
+"""Difference of angles that encoders have."""
+STEP_PART: Final = 0.2
+"""Or this part of the step between views, whichever is more."""
+SAME_PIXEL: Final = 0.02
+"""Relative difference of pixels, some of which are stated with two digits."""
+
+
+def angle_findings(geometry: ConeVec, stated_rad: npt.ArrayLike) -> Iterator[Finding]:
+    """Compare a file's angles with the geometry's, whatever their zero and sense are.
+
+    Args:
+        geometry: n views.
+        stated_rad: (n,) [rad].
+    """
+    stated = np.asarray(stated_rad, dtype=np.float64).ravel()
+    if len(stated) != len(geometry) or len(stated) < 3 or not np.isfinite(stated).all():
+        return
+    if not about_z(geometry) or np.ptp(stated) == 0.0:
+        return
+    own = np.asarray(azimuths(geometry))
+    off = _worst(own, stated)
+    step = float(np.median(np.abs(_wrapped(np.diff(own)))))
+    allowed = max(math.radians(SAME_ANGLE_DEG), STEP_PART * step)
+    if off <= allowed:
+        return
+    figure = math.degrees(off)
+    for scale, words in ((math.pi / 180, "degrees"), (180 / math.pi, "radians")):
+        if _worst(own, scale * stated) <= allowed:
+            span = float(np.ptp(stated))
+            cause = f"the file's angles span {span:.4g} rad and are the geometry's as {words}"
+            remedy = "does the file state the right unit?"
+            kind = "angles in degrees" if words == "degrees" else "angles in radians"
+            yield Finding(kind, cause, remedy, Severity.WARNING, figure)
+            return
+    if _same_set(own, stated, allowed):
+        cause = f"the file's angles are the geometry's in another order, up to {figure:.3g} deg off"
+        remedy = "give the views in the order of the images"
+        yield Finding("order", cause, remedy, Severity.WARNING, figure)
+        return
+    cause = f"the file's angles and those of the geometry differ by up to {figure:.3g} deg"
+    remedy = "is it the geometry of this scan?"
+    yield Finding("angles disagree", cause, remedy, Severity.WARNING, figure)
+
+
+def pixel_findings(geometry: ConeVec, stated_mm: float) -> Iterator[Finding]:
+    """Compare a file's pixel with the geometry's, on the panel or at the axis.
+
+    Args:
+        geometry: the views.
+        stated_mm: pitch of the pixels [mm].
+    """
+    if not (math.isfinite(stated_mm) and stated_mm > 0.0) or not len(geometry):
+        return
+    pitch = float(np.linalg.norm(geometry.u[0]))
+    beam = geometry.detector[0] - geometry.source[0]
+    part = float(-geometry.source[0] @ beam / (beam @ beam))
+    ratios = [stated_mm / pitch, stated_mm / (pitch * part) if part > 0.0 else math.inf]
+    if min(abs(ratio - 1.0) for ratio in ratios) <= SAME_PIXEL:
+        return
+    cause = f"the file's pixel is {stated_mm:.4g} mm, the geometry's {pitch:.4g} mm"
+    remedy = "is it the geometry of this scan, binned as its images are, and in mm?"
+    yield Finding("pixel size disagrees", cause, remedy, Severity.WARNING, ratios[0])
+
+
+def _wrapped(angle: FloatArray) -> FloatArray:
+    return np.asarray((angle + math.pi) % math.tau - math.pi)
+
+
+def _worst(own: FloatArray, stated: FloatArray) -> float:
+    """Largest difference of angles, of the better of both senses and the best zero [rad]."""
+    found = []
+    for sense in (1.0, -1.0):
+        off = own - sense * stated
+        middle = math.atan2(float(np.sin(off).mean()), float(np.cos(off).mean()))
+        found.append(float(np.abs(_wrapped(off - middle)).max()))
+    return min(found)
+
+
+def _same_set(own: FloatArray, stated: FloatArray, allowed: float) -> bool:
+    """Whether the angles are the same in another order, counted from the first or least of each."""
+    for sense in (1.0, -1.0):
+        turned = sense * stated
+        zeros = {float(turned[0]), float(turned[-1]), float(turned.min())}
+        for zero, start in product(zeros, {float(own[0]), float(own[-1])}):
+            each = np.sort((own - start + allowed) % math.tau)
+            other = np.sort((turned - zero + allowed) % math.tau)
+            if np.abs(each - other).max() <= 2 * allowed:
+                return True
+    return False
