@@ -149,8 +149,8 @@ def _require_distances(stated: list[tuple[float, float]], file: str) -> None:
     if not stated:
         return
     pairs = np.array(stated)
-    sod, sdd = np.abs(pairs).T
-    if ((sod == 0.0) | (sod > sdd * (1 + SAME))).all():
+    sod, sdd = (pairs * np.sign(pairs[:, 1:])).T
+    if ((sod <= 0.0) | (sod > sdd * (1 + SAME))).all():
         names = ("SourceToIsocenterDistance", "SourceToDetectorDistance")
         impossible = distance_findings(float(sod[0]), float(sdd[0]), 0.1 * sdd[0], names)
         settled(impossible, ExchangeError, file)

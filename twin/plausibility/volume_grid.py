@@ -16,10 +16,12 @@ POINTS: Final = 7
 """Points along each axis of a grid that are looked at."""
 MOST_UNSEEN: Final = 0.5
 """Share of a grid's points that lie beside the field of view; of a square about a circle, .21."""
+LEVEL: Final = 1e-3
+"""Rise of the source, relative to its distance from the panel, of a circle."""
 BEHIND: Final = 0.25
 """Share of the views that see a grid behind the panels of all."""
 SELDOM: Final = 0.25
-"""Share of views that see a point beside the field of view, relative to the point seen most."""
+"""Share of views that see a point beside the field of view, relative to that of the middle."""
 FEWEST_VOXELS: Final = 4
 """Voxels across a field of view."""
 
@@ -68,7 +70,11 @@ def grid_findings(
         remedy = "allowed: a grid in the field of view; are all lengths in mm?"
         yield Finding("grid not seen", cause, remedy, Severity.REFUSAL, 0.0)
         return
-    unseen = float((times < SELDOM * times.max()).mean())
+    if np.ptp(cone_vec.source[:, 2]) < LEVEL * np.abs(views.source_detector_distance).max():
+        usual = 1.0  # a circle's views all see its middle
+    else:
+        usual = float(times.max())
+    unseen = float((times < SELDOM * usual).mean())
     if unseen > MOST_UNSEEN:
         cause = (
             f"{100 * unseen:.3g} % of the grid lie beside the field of view, where values are not "
