@@ -29,7 +29,7 @@ class Code(IntEnum):
     METHOD_NOT_FOUND = -32601, "no such method"
     INVALID_PARAMS = -32602, "parameters do not fit the method"
     INTERNAL = -32603, "the server failed; details are in its log"
-    LIMIT = -32001, "outside a travel, speed or setting limit"
+    LIMIT = -32001, "outside a travel, speed or setting limit, or the disk refuses"
     COLLISION = -32002, "the motion would touch something"
     BUSY = -32003, "busy, or somebody else is the controller"
     NOT_AUTHORISED = -32004, "a valid token is needed"

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from flexdt.protocol.rpc_errors import Code, RpcError, internal
 from flexdt.twin import errors as e
-from flexdt.twin.dataset.dataset_errors import DiskFullError
+from flexdt.twin.dataset.dataset_errors import DatasetExistsError, DatasetWriteError
 from flexdt.twin.script import ScriptError
 
 
@@ -23,7 +23,8 @@ class ProjectorUnavailable(ConnectionError):
 
 CODES: Sequence[tuple[type[e.TwinError], Code]] = (
     (ScriptError, Code.SCRIPT_INVALID),
-    (DiskFullError, Code.LIMIT),
+    (DatasetExistsError, Code.INVALID_PARAMS),
+    (DatasetWriteError, Code.LIMIT),
     (e.LimitError, Code.LIMIT),
     (e.CollisionError, Code.COLLISION),
     (e.SafetyError, Code.BUSY),

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import errno
 import json
+import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
-from full_disk_histories import run_history
-from in_process import script
+from full_disk_histories import run_history, settings
+from in_process import Lab, run, script
 from simulation import Fault, Simulation
 
 from flexdt.runtime.files.spare_files import COUNT, SIZE
@@ -73,3 +75,36 @@ def test_an_estop_that_no_disk_takes_is_said(tmp_path: Path) -> None:
         sim.kill()
         sim.start()
         assert sim.call(sim.client(), "state.get")["safety"]["estop"]
+
+
+def test_a_data_directory_that_was_removed_is_the_disk_s_fault(tmp_path: Path) -> None:
+    """Not the parameters': -32602 would say that another request might do."""
+    root = tmp_path / "data"
+
+    async def body(lab: Lab) -> None:
+        c = lab.client()
+        await c.call("calibration.apply", parameters={"dD_x": 0.1}, name="one")
+        shutil.rmtree(root)
+        voxels = {"kind": "voxels", "format": "raw", "shape": [1, 1, 1], "voxel_mm": [1.0] * 3}
+        asked: dict[str, dict[str, Any]] = {
+            "tube.set": {"kV": 50.0},
+            "sample.set": {"name": "lego"},
+            "script.submit": {"text": script(3)},
+            "calibration.apply": {"parameters": {"dD_x": 0.2}, "name": "two"},
+            "calibration.revert": {},
+            "sample.upload": {"name": "a", "total": 4, "data": bytes(4), **voxels},
+            "dataset.list": {},
+        }
+        before = settings(await c.call("state.get"))
+        for method, params in asked.items():
+            error = await c.error(method, **params)
+            assert error.code == -32001, (method, error)
+            assert "No such file or directory" in error.message
+            assert str(root) not in error.message
+        assert settings(await c.call("state.get")) == before
+        assert (await c.call("safety.estop"))["safety"]["estop"]
+        await lab.until(lambda: lab.twin.keeper.problem is not None, "it is noticed")
+        assert "state.json" in (await c.call("state.get"))["unsaved"]
+
+    root.mkdir()
+    run(root, body)
