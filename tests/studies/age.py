@@ -93,7 +93,8 @@ class Old:
         self.start()
 
     def start(self) -> None:
-        self.twin = twin(self.rays.port, self.data, "--sample", "empty", "--speed-up", "max")
+        room = [f"--limit={name}=30000" for name in ("max_samples", "max_corrections")]
+        self.twin = twin(self.rays.port, self.data, "--sample", "empty", "--speed-up", "max", *room)
         self.start_s = self.twin.processor_s()
         self.wire = Wire(self.twin.port)
 
