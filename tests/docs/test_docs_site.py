@@ -11,6 +11,18 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
+QUESTIONS = sorted((DOCS / "questions").glob("*.md"))
+MOST_WORDS = 600
+"""Of a page that answers one question."""
+
+
+@pytest.mark.parametrize("page", [p for p in QUESTIONS if p.stem != "index"], ids=lambda p: p.stem)
+def test_a_question_has_a_short_answer_with_code_and_a_picture(page: Path) -> None:
+    text = page.read_text()
+    assert len(text.split()) <= MOST_WORDS
+    assert "{code-cell}" in text
+    assert "imshow" in text
+    assert f"({page.name})" in (page.parent / "index.md").read_text()
 
 
 @pytest.mark.slow
@@ -23,8 +35,8 @@ def test_site_builds_without_a_warning(tmp_path: Path) -> None:
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-6000:]
     html = tmp_path / "html"
-    for notebook in (DOCS / "tutorials").glob("*.md"):
-        page = (html / "tutorials" / f"{notebook.stem}.html").read_text()
+    for notebook in (*(DOCS / "tutorials").glob("*.md"), *QUESTIONS):
+        page = (html / notebook.relative_to(DOCS).with_suffix(".html")).read_text()
         text = notebook.read_text()
         cells = text.count("{code-cell}") - text.count("[remove-cell]")
         assert page.count('class="cell_input docutils container"') == cells

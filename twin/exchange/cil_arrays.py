@@ -1,5 +1,5 @@
 """CIL's geometry with a pose a view: the arguments of `AcquisitionGeometry.create_Cone3D_Flex` and
-of its `set_panel`, by name (CIL 24.3 or newer has it; compared with commit d051455, version 26).
+of its `set_panel`, by name (CIL 25 or newer has it; compared with commit d051455, version 26).
 
 CIL's frame is any; ours is kept. Its detector_direction_y points upwards while the data's row 0 is
 on top, which the panel's origin says: `top-left`. One pixel size holds for all views, and rows and

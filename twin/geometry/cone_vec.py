@@ -264,7 +264,7 @@ class ConeVec:
 
     def to_cil(self) -> Any:
         """CIL's `AcquisitionGeometry` with a pose a view (`create_Cone3D_Flex`), for images as they
-        are, (views, rows, columns); needs CIL 24.3 or newer and the detector's shape.
+        are, (views, rows, columns); needs CIL 25 or newer and the detector's shape.
 
         Raises:
             TwinError: skew pixels, several pixel sizes, no shape; CIL is not installed.
