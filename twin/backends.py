@@ -13,12 +13,13 @@ from typing import Any, Final
 BACKENDS: Final = {
     "dry-run pages": "flexdt.library.dry_run_page",
     "geometry files": "flexdt.library.geometry_formats",
+    "materials": "flexdt.phantoms.materials",
     "plots": "flexdt.library.plots",
     "scripts": "flexdt.library.scripts",
     "volume files": "flexdt.library.reconstruction.volume_files",
     "xarray": "flexdt.library.xarray_forms",
 }
-"""Subject -> module of the library, imported when a method first needs it."""
+"""Subject -> module of the library or of the phantoms, imported when a method first needs it."""
 
 
 def backend(subject: str) -> Any:

@@ -36,6 +36,8 @@ Topic = TopicName
 Kind = Literal["line_integral", "counts"]
 SpeedUp = float | Literal["max"]
 Positions = Mapping[str, float]
+Job = str | scans.SubmitResult | s.JobStatus
+"""A job by its name, or what submitted it or told of it."""
 
 CHUNK: Final = 4 * 2**20
 """Bytes in one message of an upload: below a frame, also as base64."""
@@ -628,7 +630,12 @@ def jobs() -> Flow[scans.JobListResult]:
     return ask(scans.JOB_LIST)
 
 
-def job_status(job: str | None = None) -> Flow[s.JobStatus]:
+def _name_of(job: Job | None) -> str | None:
+    """The job's name; None is the current or last one."""
+    return job.job if isinstance(job, scans.SubmitResult | s.JobStatus) else job
+
+
+def job_status(job: Job | None = None) -> Flow[s.JobStatus]:
     """Progress of a job; `job` defaults to the current or last one.
 
     Example:
@@ -638,10 +645,10 @@ def job_status(job: str | None = None) -> Flow[s.JobStatus]:
         >>> twin.wait_job(twin.abort_job(job).job).state in FINAL_STATES
         True
     """
-    return ask(scans.JOB_STATUS, job=job)
+    return ask(scans.JOB_STATUS, job=_name_of(job))
 
 
-def pause_job(job: str | None = None) -> Flow[s.JobStatus]:
+def pause_job(job: Job | None = None) -> Flow[s.JobStatus]:
     """Pause; a frame under exposure is discarded and taken again.
 
     Example:
@@ -653,10 +660,10 @@ def pause_job(job: str | None = None) -> Flow[s.JobStatus]:
         >>> twin.wait_job(twin.abort_job(job).job).state in FINAL_STATES
         True
     """
-    return ask(scans.JOB_PAUSE, job=job)
+    return ask(scans.JOB_PAUSE, job=_name_of(job))
 
 
-def resume_job(job: str | None = None) -> Flow[s.JobStatus]:
+def resume_job(job: Job | None = None) -> Flow[s.JobStatus]:
     """Return to the pose of the pause and go on.
 
     Example:
@@ -668,10 +675,10 @@ def resume_job(job: str | None = None) -> Flow[s.JobStatus]:
         >>> twin.wait_job(twin.abort_job(job).job).state in FINAL_STATES
         True
     """
-    return ask(scans.JOB_RESUME, job=job)
+    return ask(scans.JOB_RESUME, job=_name_of(job))
 
 
-def step_job(job: str | None = None) -> Flow[s.JobStatus]:
+def step_job(job: Job | None = None) -> Flow[s.JobStatus]:
     """Run a paused job for one step.
 
     Example:
@@ -687,10 +694,10 @@ def step_job(job: str | None = None) -> Flow[s.JobStatus]:
         >>> twin.wait_job(twin.abort_job(job).job).state in FINAL_STATES
         True
     """
-    return ask(scans.JOB_STEP, job=job)
+    return ask(scans.JOB_STEP, job=_name_of(job))
 
 
-def abort_job(job: str | None = None, reason: str | None = None) -> Flow[s.JobStatus]:
+def abort_job(job: Job | None = None, reason: str | None = None) -> Flow[s.JobStatus]:
     """End a job; its data set stays, marked incomplete, and says the reason.
 
     Example:
@@ -698,10 +705,10 @@ def abort_job(job: str | None = None, reason: str | None = None) -> Flow[s.JobSt
         >>> twin.wait_job(twin.abort_job(job).job).state
         'aborted'
     """
-    return ask(scans.JOB_ABORT, job=job, reason=reason)
+    return ask(scans.JOB_ABORT, job=_name_of(job), reason=reason)
 
 
-def forget_job(job: str | None = None, *, days: float | None = None) -> Flow[scans.JobForgetResult]:
+def forget_job(job: Job | None = None, *, days: float | None = None) -> Flow[scans.JobForgetResult]:
     """Forget an ended job, or all that ended at least `days` ago; data sets stay.
 
     Example:
@@ -711,11 +718,11 @@ def forget_job(job: str | None = None, *, days: float | None = None) -> Flow[sca
         >>> twin.forget_job(job).jobs == [job]
         True
     """
-    return ask(scans.JOB_FORGET, job=job, days=days)
+    return ask(scans.JOB_FORGET, job=_name_of(job), days=days)
 
 
 def wait_job(
-    job: str | None = None,
+    job: Job | None = None,
     progress: Callable[[s.JobStatus], object] | None = None,
     *,
     poll_s: float = 0.2,
@@ -724,7 +731,8 @@ def wait_job(
     """Wait until a job has ended, also across a lost connection.
 
     Args:
-        job: which one; the current one if left out.
+        job: which one, by name or as `submit_script` and its kin returned it; the current one if
+            left out.
         progress: called with each status.
         poll_s: time between two requests for the status [s].
         timeout_s: give up waiting after this time [s]; the job goes on.
@@ -736,8 +744,7 @@ def wait_job(
         TimeoutError: the job has not ended in time.
 
     Example:
-        >>> job = twin.submit_trajectory([{"rot_obj": 0.0}], 100.0, speed_up="max").job
-        >>> twin.wait_job(job, timeout_s=60.0).state
+        >>> twin.wait_job(twin.submit_trajectory([{"rot_obj": 0.0}], 100.0, speed_up="max")).state
         'done'
     """
     deadline = None if timeout_s is None else time.monotonic() + timeout_s
@@ -749,7 +756,7 @@ def wait_job(
         if status.state in FINAL_STATES:
             return status
         if deadline is not None and time.monotonic() > deadline:
-            raise TimeoutError(f"job {job} is {status.state} after {timeout_s:g} s")
+            raise TimeoutError(f"job {status.job} is {status.state} after {timeout_s:g} s")
         yield Sleep(poll_s)
 
 

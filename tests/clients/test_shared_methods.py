@@ -6,9 +6,15 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
+
+import pytest
 
 from flexdt.clients.client import client, twin_methods
+from flexdt.clients.client import twin_methods as m
+from flexdt.protocol.methods.job_messages import SubmitResult
 
 FILE = Path(client.__file__)
 HEAD = (
@@ -35,6 +41,17 @@ def parts() -> tuple[str, str, str]:
 def test_the_list_of_methods_is_current() -> None:
     _, now, _ = parts()
     assert now == lines(), "run `make web`, or this file"
+
+
+@pytest.mark.parametrize(
+    "method",
+    [m.job_status, m.pause_job, m.resume_job, m.step_job, m.abort_job, m.forget_job, m.wait_job],
+)
+def test_a_job_is_named_or_is_what_submitted_it(method: Callable[..., Any]) -> None:
+    """`wait_job(submit_script(...))` is the natural first try."""
+    for job in ("job-7", SubmitResult(job="job-7", dataset="d")):
+        assert next(method(job)).params["job"] == "job-7"
+    assert "job" not in next(method()).params
 
 
 if __name__ == "__main__":

@@ -343,3 +343,19 @@ def test_a_detector_comes_back_from_its_json() -> None:
     assert fx.Detector(**document) == detector
     with pytest.raises(fx.TwinError, match="pixels is 3; allowed: a PixelGrid"):
         fx.Detector(pixels=3)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["aluminium", "copper", "steel", "tungsten-carbide"])
+def test_materials_of_samples_hold_for_filters_of_tubes_too(name: str) -> None:
+    kept = fx.Tube(kV=100, filters=[(name, 0.3)]).model()
+    made = fx.phantoms.material(name)
+    assert kept.filters[0].substance.attenuation_at(60.0) == pytest.approx(
+        made.mu_at(60.0), rel=0.02
+    )
+    again = type(kept).of_figures(kept.figures())
+    assert again.filters[0].substance.density_g_cm3 == made.density_g_cm3
+    text = f'base = "flexray"\nname = "filtered"\n[[tube.filters]]\nmaterial = "{name}"\n'
+    spec = parse_machine(f"{text}thickness_mm = 0.3\n").tube
+    assert spec.filters[0].material == name
+    with pytest.raises(fx.TwinError, match=r"unknown material 'aluminum'; there are: .*aluminium"):
+        fx.Tube(filters=[("aluminum", 0.3)])

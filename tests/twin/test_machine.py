@@ -287,7 +287,7 @@ def test_profiles_are_pinned(
         ),
         ("source_x =", "sauce_x =", "geometry"),
         ("max_kV = 90.0", "max_kv = 90.0", "tube.max_kv"),
-        ('"Al@2.70"', '"aluminium"', "tube.filters.0.material: "),
+        ('"Al@2.70"', '"aluminum"', "tube.filters.0.material: "),
         ('"Al@2.70"', '"Xx@2.70"', "tube.filters.0.material: "),
         ('"Al@2.70"', '"Al@-1"', "tube.filters.0.material: "),
         ("thickness_mm = 0.5", "thickness_mm = 0", "tube.filters.0.thickness_mm: "),

@@ -18,6 +18,7 @@ from importlib import resources
 
 import numpy as np
 
+from flexdt.twin.backends import backend
 from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.geometry.conventions import FloatArray
 
@@ -145,6 +146,23 @@ class Substance:
             allowed = "FORMULA@DENSITY (g/cm3), such as Cu@8.96"
             raise LimitError.instead(f"material {text!r}", text, allowed) from None
         return cls.of(text, formula.strip(), value)
+
+    @classmethod
+    def called(cls, text: str) -> Substance:
+        """A substance by the name of a sample's material, such as aluminium, or FORMULA@DENSITY.
+
+        Raises:
+            UnknownNameError: lists the materials there are; or an element without a table.
+            LimitError: as `parse`.
+
+        Example:
+            >>> Substance.called("copper").density_g_cm3, Substance.called("Al@2.70").name
+            (8.96, 'Al@2.70')
+        """
+        if "@" in text:
+            return cls.parse(text)
+        found: Substance = backend("materials").material(text).substance
+        return found
 
     def mass_attenuation(self) -> FloatArray:
         """mu/rho at the energies of the tables, (e,) [cm2/g]."""

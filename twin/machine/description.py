@@ -254,7 +254,7 @@ class FilterSpec(_Frozen):
     """A layer between anode and sample."""
 
     material: str
-    """FORMULA@DENSITY [g/cm3], such as Cu@8.96."""
+    """By name, as samples have it, or FORMULA@DENSITY [g/cm3], such as Cu@8.96."""
     thickness_mm: float = Field(gt=0, le=100)
 
     @field_validator("material")
@@ -262,7 +262,7 @@ class FilterSpec(_Frozen):
     def _known(cls, text: str) -> str:
         from flexdt.twin.attenuation.substances import Substance
 
-        Substance.parse(text)
+        Substance.called(text)
         return text
 
 

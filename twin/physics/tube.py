@@ -83,7 +83,7 @@ class TubeModel:
             if name.startswith(_FILTER)
         }
         return cls(
-            tuple(Filter(Substance.parse(name), thick) for name, thick in layers.items()),
+            tuple(Filter(Substance.called(name), thick) for name, thick in layers.items()),
             figures["tube_spot_mm_per_W"],
             figures["tube_smallest_spot_mm"],
             int(figures.get("tube_spot_points", 1)),
@@ -93,7 +93,7 @@ class TubeModel:
 def tube_of(spec: TubeSpec) -> TubeModel:
     """The tube of a machine file."""
     return TubeModel(
-        tuple(Filter(Substance.parse(f.material), f.thickness_mm) for f in spec.filters),
+        tuple(Filter(Substance.called(f.material), f.thickness_mm) for f in spec.filters),
         spec.spot_mm_per_W,
         spec.smallest_spot_mm,
         spec.spot_points,
@@ -184,8 +184,9 @@ class Tube:
     Args:
         kV: tube voltage; the spectrum is tungsten's at 12 degrees, 20 to 240 kV.
         power_W: power on the anode [W]; power_W / kV is the current [mA].
-        filters: layers from the anode to the sample, (FORMULA@DENSITY in g/cm3, thickness [mm])
-            each; None for 0.5 mm of aluminium, () for nothing.
+        filters: layers from the anode to the sample, (name of a material, as samples have it, or
+            FORMULA@DENSITY in g/cm3, thickness [mm]) each; None for 0.5 mm of aluminium, () for
+            nothing.
         spot_mm: focal spot, full width at half maximum [mm]; None: 1 um for each watt, at least
             7 um.
         mono_keV: all photons have this energy, as many as give the spectrum's signal in the open
@@ -193,10 +194,10 @@ class Tube:
 
     Raises:
         LimitError: a setting that has no spectrum; says what is allowed.
-        UnknownNameError: an element without a table.
+        UnknownNameError: a material or an element without a table.
 
     Example:
-        >>> Tube(kV=120, power_W=30, filters=[("Cu@8.96", 0.2)]).exposure(200.0).power_W
+        >>> Tube(kV=120, power_W=30, filters=[("copper", 0.2)]).exposure(200.0).power_W
         30.0
     """
 
@@ -244,7 +245,7 @@ class Tube:
 
 def _filter(layer: tuple[str, float] | Filter) -> Filter:
     if not isinstance(layer, Filter):
-        layer = Filter(Substance.parse(layer[0]), float(layer[1]))
+        layer = Filter(Substance.called(layer[0]), float(layer[1]))
     name = f"Tube: filter {layer.substance.name}"
     require_within(name, layer.thickness_mm, 0.0, 1e3, "mm")
     return layer
