@@ -17,7 +17,7 @@ from flexdt.twin.physics.predicted_beam import Physics
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.parse import Source, content, read_script
 from flexdt.twin.script.planning.beam_view import View, views
-from flexdt.twin.script.planning.check_findings import Clearance, Dose, Optics
+from flexdt.twin.script.planning.check_findings import Clearance, Dose, Optics, cut_off
 from flexdt.twin.script.planning.open_beam_findings import open_beam_problems
 from flexdt.twin.script.planning.plan import CheckReport, ScanPlan
 from flexdt.twin.script.planning.plan_values import SampleSize, StartState
@@ -158,17 +158,10 @@ def _truncation_problems(seen: Sequence[View]) -> list[ScriptProblem]:
     for view in seen:
         if view.outside.all() or not (view.right > view.left).any():
             continue
-        parts = [
-            f"{name} by {px:.0f} {pixels}"
-            for pixels, names, cut in (
-                ("columns", ("left", "right"), view.cut_columns),
-                ("rows", ("top", "bottom"), view.cut_rows),  # NaN where the height is unknown
-            )
-            for name, px in zip(names, np.min(cut, axis=0).tolist(), strict=True)
-            if px > 0.5
-        ]
-        if parts:
-            what = f"the sample is cut off over the rotation: {', '.join(parts)}"
+        names, cuts = ("left", "right", "top", "bottom"), (view.cut_columns, view.cut_rows)
+        least = [px for cut in cuts for px in np.min(cut, axis=0).tolist()]  # NaN: height unknown
+        if parts := cut_off(dict(zip(names, least, strict=True))):
+            what = f"the sample is cut off over the rotation: {parts}"
             found.append(ScriptProblem("warning", "truncated", min(view.lines), 1, what))
     return found
 

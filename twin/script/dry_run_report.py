@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from flexdt.twin.backends import backend
 from flexdt.twin.script.log_fit import LogComparison
-from flexdt.twin.script.planning.check_findings import Optics
+from flexdt.twin.script.planning.check_findings import Optics, cut_off
 from flexdt.twin.script.planning.plan import HOME_ASSUMED, CheckReport
 from flexdt.twin.script.planning.time_ranges import Range, total_range
 
@@ -80,8 +80,8 @@ def _optics_facts(o: Optics) -> Facts:
         ),
     ]
     if o.truncation is not None:
-        cut = [f"{side} {px:.0f} px" for side, px in o.truncation.items() if px > 0.5]
-        facts.append(("  truncation", ", ".join(cut) if cut else "none"))
+        cut = cut_off(o.truncation)
+        facts.append(("  truncation", f"in the worst image {cut}" if cut else "none"))
     return facts
 
 

@@ -281,7 +281,9 @@ def test_figures_of_the_report_in_words(flexray: Machine, profile: Profile) -> N
     assert repr(made).startswith("<CheckReport: ok, 0 collisions, of <ScanPlan on flexray: ")
     assert "<details>" in html_report(made)
     wide = report(flexray, profile, sample=SampleSize(80.0))
-    assert dict(summary(wide))["  truncation"] == "left 58 px, right 58 px"
+    assert dict(summary(wide))["  truncation"] == (
+        "in the worst image left by 58 columns, right by 58 columns"
+    )
     assert dict(summary(wide))["duration"].startswith("0 min ")
     free = Clearance((), 12.5, ("sample", "source"), ((0.0, 12.5),))
     hit = Clearance((Collision(10, 4.5, ("sample", "source"), {}),), 0.5, ("sample", "source"))

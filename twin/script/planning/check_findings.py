@@ -4,8 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Final
 
 Trace = tuple[tuple[float, float], ...]
+
+
+PIXELS: Final = {"left": "columns", "right": "columns", "top": "rows", "bottom": "rows"}
+"""Side of an image -> what is cut off there."""
+LEAST_PX: Final = 0.5
+"""From which on something is cut off."""
+
+
+def cut_off(sides: Mapping[str, float]) -> str:
+    """How far the sample is cut off, in words; "" where it is not.
+
+    Args:
+        sides: left, right, top, bottom -> pixels.
+    """
+    return ", ".join(f"{s} by {px:.0f} {PIXELS[s]}" for s, px in sides.items() if px > LEAST_PX)
 
 
 @dataclass(frozen=True)
