@@ -45,18 +45,6 @@ def file_stem(name: str) -> str:
     return stem
 
 
-def used_bytes(root: Directory) -> int:
-    """Bytes of all files in a directory and its folders; links are not followed."""
-    total = 0
-    with suppress(OSError), root.entries() as entries:  # a job may rename meanwhile
-        for e in entries:
-            if e.is_dir(follow_symlinks=False):
-                total += used_bytes(root.folder(e.name))
-            else:
-                total += e.stat(follow_symlinks=False).st_size
-    return total
-
-
 @dataclass(frozen=True)
 class _Change:
     """A file that was written or deleted.

@@ -173,6 +173,15 @@ class JobRecord:
             log("the record of a complete scan was not deleted", logging.WARNING,
                 reason=str(error))  # fmt: skip
 
+    @staticmethod
+    def forget(changes: Changes, root: Directory, name: str) -> None:
+        """Delete the one of a data set, among other changes.
+
+        Raises:
+            DatasetWriteError: the system refuses.
+        """
+        changes.remove(root.folder(FOLDER), f"{file_stem(name)}.json")
+
     @classmethod
     def read(cls, root: Directory, name: str) -> JobRecord:
         """The one of the data set `name`; one that is damaged is set aside.

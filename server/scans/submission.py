@@ -77,6 +77,8 @@ class Submissions:
     version: str
     room: DiskRoom
     checks: Checks = field(default_factory=Checks)
+    _numbered: tuple[str, int] = field(default=("", 1), init=False)
+    """A day, and the number of its scan that was named last."""
 
     async def check(self, wish: ScanSource, codec: Codec) -> Encoded:
         """The dry-run report from where the scanner stands; nothing moves.
@@ -350,9 +352,15 @@ class Submissions:
 
     def _free_name(self) -> str:
         """As the scanner names its scans: date and number."""
-        used = {job.name for job in self.jobs.all()}
-        names = (dated_name(self.now(), n) for n in itertools.count(1))
-        return next(n for n in names if n not in used and self.root.stat(n) is None)
+        used, now = {job.name for job in self.jobs.all()}, self.now()
+        if self._numbered[0] != dated_name(now, 0):
+            self._numbered = dated_name(now, 0), 1
+        day, last = self._numbered
+        numbers = ((n, dated_name(now, n)) for n in itertools.count(last))
+        free = ((n, name) for n, name in numbers if name not in used)
+        number, name = next((n, name) for n, name in free if self.root.stat(name) is None)
+        self._numbered = day, number  # the next look does not begin with the first of the day
+        return name
 
     def _require_room(self, size: int, name: str) -> None:
         """Refuse a scan that the disk cannot hold."""

@@ -7,18 +7,83 @@ spare files (`runtime/files/spare_files.py`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import os
+import threading
+import time
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Final
 
 from flexdt.runtime.files.directory import Directory, free_bytes
-from flexdt.runtime.files.own_documents import used_bytes
 from flexdt.twin.dataset.dataset_errors import DiskFullError
 
 RESERVE_BYTES: Final = 16 << 20
 """Left free by what is about to begin: for texts, documents and the file system's own needs."""
+SETTLED_NS: Final = 2 * 10**9
+"""After which a folder's time of change tells whether it has changed since it was read."""
 LAST_BYTES: Final = 4 << 20
 """Left free by each image and each part of an upload."""
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """A folder as it was: its time of change, bytes of its own files, and its folders."""
+
+    changed_ns: int
+    nbytes: int
+    folders: tuple[str, ...]
+
+
+class UsedBytes:
+    """How many bytes a directory holds; folders that have not changed are not read again.
+
+    Args:
+        root: the directory.
+    """
+
+    def __init__(self, root: Directory) -> None:
+        self._root = root
+        self._seen: dict[str, _Seen] = {}
+
+    def count(self) -> int:
+        """Bytes of all files in it and its folders; links are not followed."""
+        with suppress(OSError):
+            changed_ns = os.stat(self._root.fileno() or self._root.path).st_mtime_ns
+            there: dict[str, _Seen] = {}
+            total = self._count(self._root, "", changed_ns, there)
+            self._seen = there  # without folders that have gone
+            return total
+        return 0
+
+    def _count(self, folder: Directory, name: str, changed_ns: int, there: dict[str, _Seen]) -> int:
+        seen = self._seen.get(name)
+        # A change within the clock's grain does not show: what is young is read again.
+        old = time.time_ns() - changed_ns > SETTLED_NS
+        if seen is None or seen.changed_ns != changed_ns or not old:
+            seen = _read(folder, changed_ns)
+        there[name] = seen
+        total = seen.nbytes
+        for inner in seen.folders:
+            with suppress(OSError):  # it may have gone meanwhile
+                about = folder.stat(inner)
+                if about is not None:
+                    below = folder.folder(inner)
+                    total += self._count(below, f"{name}/{inner}", about.st_mtime_ns, there)
+        return total
+
+
+def _read(folder: Directory, changed_ns: int) -> _Seen:
+    nbytes, folders = 0, list[str]()
+    with folder.entries() as entries:
+        for entry in entries:
+            with suppress(OSError):
+                if entry.is_dir(follow_symlinks=False):
+                    folders.append(entry.name)
+                else:
+                    nbytes += entry.stat(follow_symlinks=False).st_size
+    return _Seen(changed_ns, nbytes, tuple(folders))
 
 
 @dataclass(frozen=True)
@@ -32,9 +97,14 @@ class DiskRoom:
 
     root: Directory
     quota: int | None = None
+    _lock: threading.Lock = field(default_factory=threading.Lock, init=False, repr=False)
+
+    @cached_property
+    def _used(self) -> UsedBytes:
+        return UsedBytes(self.root)
 
     def require(self, what: str, size: int, there: int = 0) -> None:
-        """Refuse what the disk cannot hold, or the quota does not allow; it walks the directory.
+        """Refuse what the disk cannot hold, or the quota does not allow.
 
         Args:
             what: that is about to begin.
@@ -46,7 +116,8 @@ class DiskRoom:
         """
         need, free = size + RESERVE_BYTES - there, free_bytes(self.root.path)
         if self.quota is not None:
-            left = max(0, self.quota - used_bytes(self.root))
+            with self._lock:
+                left = max(0, self.quota - self._used.count())
             free = left if free is None else min(free, left)
         if free is not None and free < need:
             raise DiskFullError(

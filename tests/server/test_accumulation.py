@@ -6,9 +6,11 @@ what was acknowledged, which shares no code with the server, says what must be k
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import random
+import shutil
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -21,6 +23,9 @@ from simulation import Client, Crashed, Fault, Simulation
 
 from flexdt.protocol import RpcError
 from flexdt.runtime.access import TwinLimits
+from flexdt.runtime.files.directory import Directory, open_data
+from flexdt.server.storage import disk_room
+from flexdt.server.storage.disk_room import UsedBytes
 from flexdt.server.storage.job_files import JobFiles
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 
@@ -301,8 +306,22 @@ def test_what_is_in_use_is_not_deleted_and_the_answer_says_why(tmp_path: Path) -
         assert (await c.call("job.forget", job=job))["jobs"] == [job]
         with pytest.raises(RpcError, match="no jobs yet"):
             await c.call("job.status", job=job)
-        # What a forgotten scan left goes on if it is submitted again.
-        assert (lab.root / "jobs").exists()
+        # What a forgotten scan left goes on if it is submitted again; of one whose data set is gone
+        # nothing is left.
+        first, second = ["kept", "gone"]
+        for name in (first, second):
+            lab.projector.limit = lab.projector.views + 1
+            job = (await c.call("script.submit", text=script(3), name=name))["job"]
+            await lab.until(lambda: (lab.root / name / "flexdt.json").exists(), "it begins")  # noqa: B023
+            await c.call("job.abort", job=job)
+            await lab.ended(c, job)
+        lab.projector.limit = None
+        shutil.rmtree(lab.root / second)
+        await c.call("job.forget", days=0.0)
+        records = {f.stem for f in (lab.root / "jobs").glob("*.json")}
+        assert (first in records, second in records) == (True, False)
+        job = (await c.call("script.submit", text=script(3), name=first))["job"]
+        assert (await lab.ended(c, job))["state"] == "done"
 
     run(tmp_path, body)
 
@@ -364,3 +383,69 @@ def test_revert_goes_back_through_what_was_put_in_force_whatever_was_killed(
             stack.pop()
             found = sim.call(client, "calibration.get")["correction"]
             assert (found and found["name"]) == (stack[-1] if stack else None)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_a_directory_holds_is_counted_without_reading_it_all_again(
+    seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng, read, moments = random.Random(seed), list[str](), itertools.count(1)
+    used = UsedBytes(open_data(tmp_path))
+    real = disk_room._read
+
+    def noted(folder: Directory, changed_ns: int) -> Any:
+        read.append(folder.path.name)
+        return real(folder, changed_ns)
+
+    monkeypatch.setattr(disk_room, "_read", noted)
+
+    def touch(folder: Path) -> None:
+        """Its time of change, long ago, as a clock of finer grain would have it."""
+        os.utime(folder, ns=(0, next(moments)))
+
+    for number in range(30):
+        folders = [d for d in tmp_path.rglob("*") if d.is_dir()]
+        files = [f for f in tmp_path.rglob("*") if f.is_file()]
+        place = rng.choice([tmp_path, *folders])
+        match rng.choice(["file", "file", "folder", "gone", "none"]):
+            case "file":
+                (place / f"f{number}").write_bytes(bytes(rng.randint(0, 99)))
+            case "folder":
+                (place / f"d{number}").mkdir()
+                touch(place / f"d{number}")
+            case "gone" if files:
+                place = rng.choice(files).parent
+                rng.choice([f for f in place.iterdir() if f.is_file()]).unlink()
+            case _:
+                place = None  # type: ignore[assignment]
+        if place is not None:
+            touch(place)
+        read.clear()
+        assert used.count() == sum(f.stat().st_size for f in tmp_path.rglob("*") if f.is_file())
+        assert len(read) <= 3, "what has changed, and a new folder in it"
+
+
+def test_scans_without_names_are_numbered_without_looking_at_all_of_the_day(
+    tmp_path: Path,
+) -> None:
+    async def body(lab: Lab) -> None:
+        c, stat, looked = lab.client(), lab.twin.directory.stat, list[str]()
+        made = datetime.now(UTC)
+        for n in range(1, 41):
+            (lab.root / f"{made:%y%m%d}_{n:03d}").mkdir()
+        names = []
+        with mock.patch.object(
+            lab.twin.submissions, "root", mock.Mock(wraps=lab.twin.directory)
+        ) as root:
+            root.path = lab.twin.directory.path
+            root.stat.side_effect = lambda name: looked.append(name) or stat(name)
+            for _ in range(3):
+                looked.clear()
+                job = (await c.call("script.submit", text=script(3)))["job"]
+                names.append((await lab.ended(c, job))["name"])
+                found = [name for name in looked if name.startswith(f"{made:%y%m%d}_")]
+        assert len(set(names)) == 3
+        assert names[-1].endswith("_043") or made.day != datetime.now(UTC).day
+        assert len(found) < 10
+
+    run(tmp_path, body)

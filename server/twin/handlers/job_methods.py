@@ -18,7 +18,7 @@ from flexdt.protocol.rpc_errors import invalid_params, too_large
 from flexdt.runtime.files.own_documents import Changes
 from flexdt.runtime.wire_errors import from_root
 from flexdt.server.scans.scan_job import ENDED, Job
-from flexdt.server.scans.scan_record import ScanSource
+from flexdt.server.scans.scan_record import JobRecord, ScanSource
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers import handler as h
 from flexdt.twin.dataset.dataset_errors import DatasetError
@@ -120,6 +120,8 @@ async def forget(twin: TwinServer, client: h.Client, params: p.JobForget) -> p.J
     def files(changes: Changes) -> None:
         for job in jobs:
             twin.job_files.remove(changes, job.id)
+            if twin.directory.stat(job.name) is None:  # nothing is left to go on with
+                JobRecord.forget(changes, twin.directory, job.name)
 
     def take() -> list[Job]:
         gone = [job for job in jobs if job.phase in ENDED]  # one may have been resumed meanwhile
