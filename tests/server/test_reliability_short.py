@@ -67,6 +67,12 @@ def test_full_disks_lose_nothing() -> None:
 
 
 @pytest.mark.campaign
+def test_pages_and_programs_are_answered_beside_a_flood_at_any_port() -> None:
+    """It fails without an answer, or where a process has ended."""
+    run("port_floods.py", "--count", "3", "viewer", "projector", "pages of the twin")
+
+
+@pytest.mark.campaign
 def test_many_clients_keep_their_order() -> None:
     out = run("load.py", "--clients", "30", "--seconds", "2")
     assert out.count("0 out of order, 0 cut off") == 2
