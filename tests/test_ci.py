@@ -83,6 +83,34 @@ def test_every_campaign_is_in_a_weekly_job() -> None:
     assert [path.relative_to(ROOT).as_posix() for path in left] == []
 
 
+NEEDS = re.compile(r"`[^`\n]*(?:CHECKOUT|evidence --data|--leap )[^`\n]*`")
+"""A command that needs what CI lacks: others' data or programs."""
+DATE = re.compile(r"\b20\d\d-\d\d-\d\d\b")
+
+
+def others_commands() -> list[tuple[str, str, str]]:
+    """Each such command of the documentation: page, command, and the row or paragraph around it."""
+    found = []
+    for page in sorted((ROOT / "docs").rglob("*.md")):
+        text = re.sub(r"^```.*?^```", "", page.read_text("utf-8"), flags=re.MULTILINE | re.DOTALL)
+        for block in re.split(r"\n\n|\n(?=\|)", text):
+            for command in NEEDS.findall(block):
+                found.append((page.relative_to(ROOT).as_posix(), command.strip("`"), block))
+    return found
+
+
+def test_figures_that_ci_cannot_make_are_dated_and_made_weekly() -> None:
+    known = others_commands()
+    assert len({command for _, command, _ in known}) >= 4
+    weekly = "\n".join(commands(workflow("weekly.yml")["jobs"]["others"]))
+    for page, command, block in known:
+        assert DATE.search(block), (page, command)
+        program = re.search(r"\S+\.py|flexdt evidence", command)
+        assert program is not None, command
+        assert program[0] in weekly, (page, command)
+        assert program[0] == "flexdt evidence" or (ROOT / program[0]).is_file()
+
+
 MAKE = """#!/bin/sh
 echo "make $*" >> calls
 case "$*" in
