@@ -9,6 +9,7 @@ changes from the connection's subscription, and puts through a coroutine. Values
 from __future__ import annotations
 
 import asyncio
+import atexit
 import contextlib
 import ssl as tls
 import time
@@ -30,6 +31,9 @@ RATE_HZ = 20.0
 
 PATIENCE_S = 0.1
 """How long to wait for an event before the state is requested."""
+
+AT_EXIT_S = 2.0
+"""How long Python's end waits for a silent server."""
 
 
 class LimitsExceeded(ValueError):
@@ -75,6 +79,7 @@ class LabConnection:
         self._news = asyncio.Event()
         self._connecting = asyncio.Lock()
         self._pump: asyncio.Task[None] | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
 
     async def connect(self) -> None:
         """Connect, once.
@@ -89,14 +94,28 @@ class LabConnection:
             await self.client.connect()
             await self.fresh()
             self._pump = asyncio.create_task(self._listen(), name="flexdt-lab")
+            self._loop = asyncio.get_running_loop()
+            atexit.register(self._end_at_exit)
 
     async def close(self) -> None:
         """End the connection."""
+        atexit.unregister(self._end_at_exit)
         if self._pump is not None:
             self._pump.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await self._pump
         await self.client.close()
+
+    def _end_at_exit(self) -> None:
+        """End a connection that nobody closed, while RunEngine's loop still runs in its thread.
+
+        Python's end would destroy its waiting tasks, each with lines on standard error.
+        """
+        if self._loop is None or not self._loop.is_running():
+            return
+        ending = asyncio.run_coroutine_threadsafe(self.close(), self._loop)
+        with contextlib.suppress(Exception):  # of a server that is gone
+            ending.result(AT_EXIT_S)
 
     async def fresh(self) -> State:
         """Request the present state."""

@@ -531,3 +531,30 @@ def test_the_pages_programme_runs(servers: Servers, twin: TwinClient, tmp_path: 
     exec(block, names)
     drive(names["lab"].close())
     assert len(list(tmp_path.glob("*.tif"))) == 2
+
+
+LEAVING = """
+import sys
+from bluesky import RunEngine
+import bluesky.plan_stubs as bps
+from ophyd_async.core import StaticPathProvider, UUIDFilenameProvider, init_devices
+from flexdt_extensions.bluesky import TwinLab
+
+engine = RunEngine({})
+where = StaticPathProvider(UUIDFilenameProvider(), "camera")
+with init_devices():
+    lab = TwinLab(where, sys.argv[1], int(sys.argv[2]))
+engine(bps.rd(lab.rot_obj))
+print("done")
+"""
+
+
+def test_a_process_that_leaves_without_closing_says_nothing(
+    servers: Servers, twin: TwinClient, tmp_path: Path
+) -> None:
+    del twin  # it waits until the servers answer
+    words = [sys.executable, "-c", LEAVING, servers.address[0], str(servers.address[1])]
+    done = subprocess.run(
+        words, capture_output=True, text=True, timeout=120, cwd=tmp_path, check=False
+    )
+    assert (done.returncode, done.stdout.strip(), done.stderr) == (0, "done", "")
