@@ -7,8 +7,9 @@ a program. The server maps the types to wire codes.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from difflib import get_close_matches
 from numbers import Real
-from typing import Self
+from typing import Final, Self
 
 
 class TwinError(ValueError):
@@ -108,8 +109,45 @@ class SafetyError(TwinError):
     """Refused because of the safety state (E-stop in force, move aborted)."""
 
 
+MEANT: Final = "did you mean"
+"""Words before the proposal of a name."""
+LONGEST_NAME: Final = 80
+"""Characters of a name that is compared with others."""
+
+
+def nearest_name(asked: str, names: Sequence[str]) -> str | None:
+    """Give the name that is most like the one asked for; None if none is.
+
+    Upper and lower case do not matter.
+
+    Example:
+        >>> nearest_name("Axes.Move", ["axes.move", "axes.home"])
+        'axes.move'
+    """
+    if len(asked) > LONGEST_NAME:
+        return None
+    by_small = {name.lower(): name for name in reversed(names)}
+    near = get_close_matches(asked.lower(), by_small, 1)
+    return by_small[near[0]] if near else None
+
+
 class UnknownNameError(TwinError):
-    """An axis, component, sample or setting that does not exist; lists the valid names."""
+    """An axis, component, sample or setting that does not exist; lists the valid names.
+
+    The message ends with the valid name that is most like the one asked for, if any is.
+
+    Example:
+        >>> print(UnknownNameError("no axis 'rot'", {"asked": "rot", "allowed": ["rot_obj"]}))
+        no axis 'rot'; did you mean 'rot_obj'?
+    """
+
+    def __init__(self, message: str, data: Mapping[str, object] | None = None) -> None:
+        facts = dict(data or {})
+        asked, allowed = facts.get("asked"), facts.get("allowed")
+        if isinstance(asked, str) and isinstance(allowed, Sequence) and MEANT not in message:
+            near = nearest_name(asked, [name for name in allowed if isinstance(name, str)])
+            message += "" if near is None else f"; {MEANT} {near!r}?"
+        super().__init__(message, facts)
 
     @classmethod
     def among(cls, problem: str, asked: str, allowed: Iterable[str], more: str = "") -> Self:

@@ -14,12 +14,11 @@ import types
 import typing
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from difflib import get_close_matches
 from functools import cached_property, wraps
 from numbers import Real
 from typing import Annotated, Any, Final, Literal, NamedTuple, ParamSpec, Protocol, TypeVar
 
-from flexdt.twin.errors import GeometryError, LimitError
+from flexdt.twin.errors import GeometryError, LimitError, nearest_name
 
 P = ParamSpec("P")
 Result = TypeVar("Result")
@@ -241,8 +240,8 @@ class Known:
                 warnings.warn(text, DeprecationWarning, stacklevel=4)
                 found[other] = value
             else:
-                near = get_close_matches(name, self._names(), 1)
-                hint = f" (did you mean {near[0]!r}?)" if near else ""
+                near = nearest_name(name, self._names())
+                hint = "" if near is None else f" (did you mean {near!r}?)"
                 said = f"{where} has no argument {name!r}{hint}"
                 raise ArgumentError.instead(said, name, self._names())
         return found

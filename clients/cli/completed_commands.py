@@ -15,6 +15,7 @@ import typer
 
 from flexdt.clients.cli.console import emit, say
 from flexdt.clients.cli.twin_connection import connect
+from flexdt.runtime.files.writable import require_writable
 from flexdt.runtime.settings import described, has_parameters
 
 GIVEN: Final = ("context", "twin", "json")
@@ -33,6 +34,8 @@ def completed(command: Callable[..., Any]) -> tuple[Callable[..., None], tuple[s
         if getattr(parameter.default, "help", "") is None:
             parameter.default.help = helps.get(name)
 
+    outputs = [name for name, p in own.items() if getattr(p.default, "written", False)]
+
     @wraps(command)
     def complete(context: typer.Context, **given: Any) -> None:
         root = context.find_root().params
@@ -42,6 +45,8 @@ def completed(command: Callable[..., Any]) -> tuple[Callable[..., None], tuple[s
             given["twin"] = partial(connect, root["server"], root["token_file"])
         if "json" in own:
             given["json"] = root["json"]
+        for name in outputs:
+            require_writable(given[name])
         answer = command(**given)
         for part in answer if yields else ():
             if isinstance(part, str) and not root["json"]:

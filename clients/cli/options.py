@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from flexdt.clients.cli.twin_connection import DEFAULT_SERVER
+from flexdt.clients.cli.value_completion import machine_names, profile_names
 
 if TYPE_CHECKING:
     from flexdt.clients.client.client import TwinClient
@@ -17,6 +18,8 @@ Answer = Iterator[object]
 """What most commands yield: texts, which are lines for people, and one thing that is no text, which
 is the document of `--json`."""
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
+Proposer = Callable[[str], list[str]]
+"""Gives the values that begin with the part of a word that was typed."""
 Twin = Callable[[], "TwinClient"]
 """Connects to the twin that the command line names, for use as `with twin() as client`."""
 Server = Annotated[
@@ -32,13 +35,19 @@ TokenFile = Annotated[
 MachineName = Annotated[
     str | None,
     typer.Option(
-        "--machine", metavar="FILE or NAME", help="Use this machine: a shipped name or a TOML file."
+        "--machine",
+        metavar="FILE or NAME",
+        help="Use this machine: a shipped name or a TOML file.",
+        autocompletion=machine_names,
     ),
 ]
 ProfileName = Annotated[
     str | None,
     typer.Option(
-        "--profile", metavar="NAME", help="Use the zero offsets of this calibration profile."
+        "--profile",
+        metavar="NAME",
+        help="Use the zero offsets of this calibration profile.",
+        autocompletion=profile_names,
     ),
 ]
 Free = Annotated[
@@ -74,7 +83,12 @@ Push = Annotated[bool, typer.Option("--push", help="Put the correction in force 
 
 
 def option(
-    default: object, *words: str, among: Callable[[], Iterable[str]] | None = None, **details: Any
+    default: object,
+    *words: str,
+    among: Callable[[], Iterable[str]] | None = None,
+    proposes: Proposer | None = None,
+    written: bool = False,
+    **details: Any,
 ) -> Any:
     """The default of a command's parameter that the command line offers as an option.
 
@@ -85,15 +99,27 @@ def option(
             off. The help is that of the command's docstring (`Args:`) if it is not given here.
         among: gives the words that are allowed. It is called when the command line is built, so
             that each list has one home, and imports nothing heavy.
+        proposes: gives the values that a shell completes, see `value_completion`.
+        written: it is a path that the command writes to; it is tried before the command begins.
         details: of `typer.Option`, such as metavar, min and max.
     """
     flags = [word for word in words if word.startswith("-")]
     help = next((word for word in words if not word.startswith("-")), None)
-    made = typer.Option(default, *flags, help=help, **details)
+    made = typer.Option(default, *flags, help=help, autocompletion=proposes, **details)
     made.among = among
+    made.written = written
     return made
 
 
-def argument(default: object, metavar: str, help: str = "") -> Any:
-    """The default of a command's parameter that is a word of its own; `...` if it must be given."""
-    return typer.Argument(default, metavar=metavar, help=help or None)
+def argument(
+    default: object, metavar: str, help: str = "", proposes: Proposer | None = None
+) -> Any:
+    """Declare a command's parameter that is a word of its own.
+
+    Args:
+        default: where the word is left out; `...` if it must be given.
+        metavar: the word in the help.
+        help: one line; default: that of the command's docstring.
+        proposes: gives the values that a shell completes, see `value_completion`.
+    """
+    return typer.Argument(default, metavar=metavar, help=help or None, autocompletion=proposes)

@@ -79,15 +79,21 @@ def port_of(name: str, asked: int, known: Addresses) -> int:
     return known[name].port if name in known else asked
 
 
-def port_problem(host: str, port: int) -> str | None:
-    """Why `port` cannot be listened on, or None; port 0 means any free one."""
+def port_problem(option: str, host: str, port: int) -> str | None:
+    """Say why a port cannot be listened on; None if it can.
+
+    Args:
+        option: that chooses the port.
+        host: address to listen on.
+        port: 0 means any free one.
+    """
     try:
         with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((host, port))
     except OSError as error:
         where = f"cannot listen on {Address(host, port)}: {error.strerror}"
-        return f"{where}; choose another port, or 0 for any free one"
+        return f"{where}; choose another {option}, or 0 for any free one"
     return None
 
 
@@ -109,11 +115,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run until stopped; returns the exit code."""
     options = parse(UpSettings, argv)
     secure = options.tls_cert is not None
-    wanted = [(options.host, options.port), (LOOPBACK, options.projector_port)]
+    wanted = [
+        ("--port", options.host, options.port),
+        ("--projector-port", LOOPBACK, options.projector_port),
+    ]
     if not options.no_viewer:
-        wanted.append((options.host, options.viewer_port))
+        wanted.append(("--viewer-port", options.host, options.viewer_port))
     if options.gateway_port:
-        wanted += [(LOOPBACK, options.gateway_port), (LOOPBACK, options.gateway_port + 1)]
+        pair = (options.gateway_port, options.gateway_port + 1)
+        wanted += [("--gateway-port", LOOPBACK, port) for port in pair]
     # Before anything starts: a server would say it once its kernels are compiled, and end all.
     missing = lacking("zmq", "pyzmq", "gateway") if options.gateway_port is not None else None
     if missing is not None:

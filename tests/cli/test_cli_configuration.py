@@ -247,3 +247,9 @@ def test_a_shell_completes_commands_and_options() -> None:
 
     assert {"state", "stop", "study"} <= offered("flexdt st")
     assert "--phantom" in offered("flexdt calibrate --ph")
+    assert {"ver_tube", "ver_det"} <= offered("flexdt jog ver")
+    assert "mag_obj=" in offered("flexdt move mag")
+    assert offered("flexdt check script.txt --machine xy") == {"xyzr_cabinet"}
+    assert "lego" in offered("flexdt sample le")
+    assert "normal" in offered("flexdt calibrate --phantom nor")
+    assert offered("flexdt expose --material stee") == {"steel"}

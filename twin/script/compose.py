@@ -413,6 +413,8 @@ def _check_counts(request: _Request) -> None:
     for name, value, least, most in rules:
         if not (math.isfinite(value) and least <= value <= most):
             what = f"{name} is {value:g}; allowed: {least:g} to {most:g}"
+            if name == "sod_mm" and value > most:
+                what += ", the sdd_mm: are the two swapped?"
             raise LimitError(what, {"setting": name, "asked": value, "allowed": [least, most]})
 
 

@@ -12,13 +12,13 @@ binary data in which TAB, CR and LF may be part of the argument.
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 from flexdt.twin.backends import backend
+from flexdt.twin.errors import nearest_name
 from flexdt.twin.script import commands as c
 from flexdt.twin.script import grammar
 from flexdt.twin.script.grammar import ArgumentError, Spec, shorten
@@ -392,9 +392,10 @@ class _Line:
         name = self.component.text
         if len(fields) < 2 or _CUSTOM_NAME.fullmatch(name) is None:
             return False
-        for own in _close(name, (*grammar.FIXED,)):
-            if grammar.match(own, [w.text for f in fields[:5] for w in _split(f)]) is not None:
-                return False
+        own = nearest_name(name, (*grammar.FIXED,))
+        words = [word.text for field in fields[:5] for word in _split(field)]
+        if own is not None and grammar.match(own, words) is not None:
+            return False
         return any(_find_wait(_split(f), 0)[1] for f in fields) or bool(_find_wait(fields, 0)[1])
 
     def _build(self, parts: _Parts) -> c.Command | None:
@@ -475,10 +476,6 @@ def _split(field: Field) -> list[Field]:
     return [Field(text, field.column) for text in field.text.split()]
 
 
-def _close(asked: str, allowed: Sequence[str]) -> list[str]:
-    return difflib.get_close_matches(asked, allowed, 1) if len(asked) <= 80 else []
-
-
 def _meant(asked: str, allowed: Sequence[str]) -> str:
-    close = _close(asked, allowed)
-    return f" (did you mean {close[0]!r}?)" if close else ""
+    near = nearest_name(asked, allowed)
+    return "" if near is None else f" (did you mean {near!r}?)"

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 
-from flexdt.clients.cli import option_values, options
+from flexdt.clients.cli import option_values, options, value_completion
 from flexdt.clients.cli.boundary import NOT_IDENTIFIABLE
 from flexdt.clients.cli.command_settings import CalibrateSettings
 from flexdt.clients.cli.commands.data_commands import said
@@ -36,13 +36,15 @@ ReadingName = Literal["axis", "mount"]
 def calibrate(
     twin: Twin,
     datasets: list[Path] | None = argument(None, "[DATASET...]"),
-    phantom: str | None = option(None, metavar="NAME, FILE or unknown"),
+    phantom: str | None = option(
+        None, metavar="NAME, FILE or unknown", proposes=value_completion.sample_names
+    ),
     free: options.Free = None,
     per_scan: str = option("", metavar="P,P,..."),
     per_frame: str = option("", metavar="P,P,..."),
     reading: ReadingName = option("axis"),
-    report: Path | None = option(None, metavar="FILE.{html,json}"),
-    tracks: Path | None = option(None, metavar="FILE.json"),
+    report: Path | None = option(None, metavar="FILE.{html,json}", written=True),
+    tracks: Path | None = option(None, metavar="FILE.json", written=True),
     geometry: list[Path] | None = option(None, metavar="FILE"),
     bead_tolerance: float | None = option(None, metavar="MM"),
     prior: list[str] | None = option(None, metavar="P=SIGMA,..."),
@@ -182,7 +184,7 @@ def _opened(folders: list[Path], geometries: list[Path] | None) -> list[DataSet]
 def align(
     twin: Twin,
     dataset: Path = argument(..., "DATASET"),
-    out: Path | None = option(None, metavar="FILE.json"),
+    out: Path | None = option(None, metavar="FILE.json", written=True),
     per_frame: bool = option(False),
     push: options.Push = False,
     geometry: options.Geometry = None,
@@ -228,7 +230,9 @@ def align(
 
 def compare(
     dataset: Path = argument(..., "DATASET"),
-    phantom: str | None = option(None, metavar="NAME or FILE"),
+    phantom: str | None = option(
+        None, metavar="NAME or FILE", proposes=value_completion.sample_names
+    ),
     tolerance: float = option(0.5, metavar="PX", min=0.0),
     out: Path | None = option(None, metavar="DIR"),
 ) -> Answer:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from flexdt.clients.cli import options
+from flexdt.clients.cli import options, value_completion
 from flexdt.clients.cli.boundary import INVALID
 from flexdt.clients.cli.commands.script_files import ScriptFile, exit_code, read_log_file, tell
 from flexdt.clients.cli.console import table
@@ -23,8 +23,10 @@ def check(
     script: ScriptFile,
     machine: options.MachineName = None,
     profile: options.ProfileName = None,
-    sample: str | None = option(None, metavar="NAME or FILE"),
-    html: Path | None = option(None, metavar="FILE"),
+    sample: str | None = option(
+        None, metavar="NAME or FILE", proposes=value_completion.sample_names
+    ),
+    html: Path | None = option(None, metavar="FILE", written=True),
     against: Path | None = option(None, metavar="LOG"),
     json: bool = False,
 ) -> Answer:

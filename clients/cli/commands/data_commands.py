@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 def reconstruct(
     twin: Twin,
     dataset: Path = argument(..., "DATASET"),
-    out: Path = option(..., metavar="FILE"),
+    out: Path = option(..., metavar="FILE", written=True),
     algorithm: str | None = option(None, among=lambda: ALGORITHMS),
     voxel: float | None = option(None, metavar="MM"),
     shape: str | None = option(None, metavar="Z,Y,X"),
@@ -282,7 +282,7 @@ Rows = Literal["down", "up"]
 def export(
     dataset: Path = argument(..., "DATASET"),
     format: str = option(..., among=exported),
-    out: Path = option(..., metavar="FILE"),
+    out: Path = option(..., metavar="FILE", written=True),
     corrected: bool = option(True, "--corrected/--nominal"),
     correction: Path | None = option(None, metavar="FILE"),
     unknown: Path | None = option(None, metavar="FILE"),
@@ -332,7 +332,7 @@ def export(
 def import_(
     file: Path = argument(..., "FILE"),
     format: str = option(..., among=imported),
-    out: Path = option(..., metavar="FILE.{json,npy}"),
+    out: Path = option(..., metavar="FILE.{json,npy}", written=True),
     like: Path | None = option(None, metavar="DATASET"),
     shape: str | None = option(None, metavar="ROWS,COLS"),
     pixel: str | None = option(None, metavar="MM or U,V"),

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from flexdt.clients.cli import options
+from flexdt.clients.cli import options, value_completion
 from flexdt.clients.cli.console import duration, size, table, warn
 from flexdt.clients.cli.options import Answer, argument, option
 from flexdt.library import machines
@@ -20,14 +20,14 @@ BEST: Final = 5
 
 def expose(
     dataset: Path | None = argument(None, "[DATASET]"),
-    sample: str = option("lego", metavar="NAME or FILE"),
-    material: str | None = option(None, metavar="M"),
+    sample: str = option("lego", metavar="NAME or FILE", proposes=value_completion.sample_names),
+    material: str | None = option(None, metavar="M", proposes=value_completion.material_names),
     kV: list[float] | None = option(None, "--kV", "--kv"),
     power: float | None = option(None, metavar="W"),
     filter: str = option("", metavar="MATERIAL:MM"),
     exposure: float | None = option(None, metavar="MS"),
     averages: int = option(1),
-    mode: str | None = option(None, metavar="NAME"),
+    mode: str | None = option(None, metavar="NAME", proposes=value_completion.mode_names),
     roi: options.Roi = None,
     frames: int = option(361),
     sod: float | None = option(None, metavar="MM"),

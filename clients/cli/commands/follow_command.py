@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flexdt.clients.cli import options
+from flexdt.clients.cli import options, value_completion
 from flexdt.clients.cli.boundary import INVALID, REFUSED, USAGE
 from flexdt.clients.cli.console import note, say
 from flexdt.clients.cli.options import Answer, argument, option
@@ -29,8 +29,10 @@ def follow(
     machine: options.MachineName = None,
     profile: options.ProfileName = None,
     script: Path | None = option(None, metavar="FILE"),
-    sample: str | None = option(None, metavar="NAME or FILE"),
-    record: Path | None = option(None, metavar="FILE"),
+    sample: str | None = option(
+        None, metavar="NAME or FILE", proposes=value_completion.sample_names
+    ),
+    record: Path | None = option(None, metavar="FILE", written=True),
     replay: Path | None = option(None, metavar="FILE"),
     frames: Path | None = option(None, metavar="DIR"),
     out: Path = option(Path(), metavar="DIR"),

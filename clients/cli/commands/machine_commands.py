@@ -60,7 +60,7 @@ def check(name: NameOrFile) -> Answer:
 
 def fit(
     logs: list[Path] = argument(..., "LOG..."),
-    out: Path = option(..., metavar="FILE"),
+    out: Path = option(..., metavar="FILE", written=True),
     base: str = option(machines.DEFAULT_MACHINE, metavar="FILE or NAME"),
 ) -> Answer:
     """Fit a machine to executed scripts: limits, rates and the times of its commands.

@@ -8,7 +8,7 @@ from typing import Final
 
 import typer
 
-from flexdt.clients.cli import option_values
+from flexdt.clients.cli import option_values, value_completion
 from flexdt.clients.cli.command_settings import MachineNewSettings
 from flexdt.clients.cli.options import Answer, argument, option
 from flexdt.clients.cli.settings_file import chosen
@@ -20,8 +20,8 @@ USUAL_BASE: Final = "xyzr_cabinet"
 
 def new(
     name: str = argument(..., "NAME"),
-    out: Path = option(..., metavar="FILE"),
-    base: str | None = option(None, metavar="NAME"),
+    out: Path = option(..., metavar="FILE", written=True),
+    base: str | None = option(None, metavar="NAME", proposes=value_completion.machine_names),
     detector: str | None = option(None, metavar="COLUMNSxROWS"),
     pitch: str | None = option(None, metavar="MM[xMM]"),
     bits: int | None = option(None),
@@ -30,7 +30,7 @@ def new(
     kv: str | None = option(None, metavar="KV or KV:KV"),
     power: float | None = option(None, metavar="W"),
     limit: list[str] | None = option(None, metavar="AXIS=LOWER:UPPER"),
-    without: list[str] | None = option(None, metavar="AXIS"),
+    without: list[str] | None = option(None, metavar="AXIS", proposes=value_completion.axis_names),
 ) -> Answer:
     """Write a short file for a machine of your own; asks for what is not said, on a terminal.
 

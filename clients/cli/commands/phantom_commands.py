@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from flexdt.clients.cli import option_values
+from flexdt.clients.cli import option_values, value_completion
 from flexdt.clients.cli.command_settings import PhantomMakeSettings
 from flexdt.clients.cli.console import note, table
 from flexdt.clients.cli.options import Answer, argument, option
@@ -37,14 +37,14 @@ def list_phantoms() -> Answer:
 
 def make(
     file: Path = argument(..., "FILE.json"),
-    like: str | None = option(None, metavar="NAME"),
+    like: str | None = option(None, metavar="NAME", proposes=value_completion.sample_names),
     size: str | None = option(None, metavar="W,B,H"),
     beads: int = option(5, metavar="K"),
     radius: float = option(2.0, metavar="MM"),
     body: str = option("abs", metavar="MATERIAL"),
     mesh: Path | None = option(None, metavar="FILE"),
     unit: str | None = option(None),
-    stl: Path | None = option(None, metavar="FILE.stl"),
+    stl: Path | None = option(None, metavar="FILE.stl", written=True),
 ) -> Answer:
     """Write a new phantom: a bead cuboid of your own size, or a mesh.
 

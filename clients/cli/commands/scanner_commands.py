@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 
 import typer
 
-from flexdt.clients.cli import option_values, options
+from flexdt.clients.cli import option_values, options, value_completion
 from flexdt.clients.cli.boundary import REFUSED
 from flexdt.clients.cli.console import duration, note, table, warn
 from flexdt.clients.cli.options import Answer, Twin, argument, option
@@ -108,7 +108,7 @@ def xrays(tube: TubeState) -> str:
 def camera(
     twin: Twin,
     exposure_ms: float | None = option(None, "--exposure", metavar="MS"),
-    mode: str | None = option(None),
+    mode: str | None = option(None, proposes=value_completion.mode_names),
     roi: options.Roi = None,
     averages: int | None = option(None),
 ) -> Answer:
@@ -150,7 +150,7 @@ JOG_POLL_S = 0.002
 
 def move(
     twin: Twin,
-    targets: list[str] = argument(..., "AXIS=VALUE..."),
+    targets: list[str] = argument(..., "AXIS=VALUE...", proposes=value_completion.axis_values),
     relative: bool = option(False, "--relative"),
     plan: bool = option(False, "--plan"),
     shortest: bool = option(False, "--shortest"),
@@ -184,7 +184,7 @@ def move(
 
 def jog(
     twin: Twin,
-    axis: str = argument(..., "AXIS"),
+    axis: str = argument(..., "AXIS", proposes=value_completion.axis_names),
     velocity: str = argument(..., "VELOCITY"),
     seconds: str | None = option(None, "--for", metavar="SECONDS"),
 ) -> Answer:
@@ -275,9 +275,9 @@ def reset(twin: Twin) -> Answer:
 
 def sample(
     twin: Twin,
-    name: str | None = argument(None, "NAME or FILE"),
+    name: str | None = argument(None, "NAME or FILE", proposes=value_completion.sample_names),
     unit: str | None = option(None, among=lambda: UNITS_MM),
-    material: str | None = option(None),
+    material: str | None = option(None, proposes=value_completion.material_names),
 ) -> Answer:
     """Put a sample on the stage, or list what there is.
 

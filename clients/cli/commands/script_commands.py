@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import typer
 
-from flexdt.clients.cli import option_values, options
+from flexdt.clients.cli import option_values, options, value_completion
 from flexdt.clients.cli.command_settings import ScriptNewSettings
 from flexdt.clients.cli.commands.script_files import exit_code, tell
 from flexdt.clients.cli.console import duration, size
@@ -23,7 +23,7 @@ Kind = Literal["fly", "step", "tiled", "helical", "calibration"]
 
 def new(
     kind: Kind = option(...),
-    file: Path | None = option(None, "--out", metavar="FILE"),
+    file: Path | None = option(None, "--out", metavar="FILE", written=True),
     sod: float | None = option(None, metavar="MM"),
     sdd: float | None = option(None, metavar="MM"),
     frames: int = option(361),
@@ -35,7 +35,7 @@ def new(
     rise: float | None = option(None, metavar="MM"),
     kv: float | None = option(None, metavar="KV"),
     power: float | None = option(None, metavar="W"),
-    mode: str | None = option(None, metavar="NAME"),
+    mode: str | None = option(None, metavar="NAME", proposes=value_completion.mode_names),
     roi: options.Roi = None,
     machine: options.MachineName = None,
     profile: options.ProfileName = None,

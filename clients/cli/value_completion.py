@@ -1,0 +1,69 @@
+"""Propose values of options and arguments to a shell that completes a word.
+
+Each function takes the part of the word that was typed and returns the values that begin with it.
+An empty list leaves the word to the shell, which proposes files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+AXIS_VALUE = "="
+"""Separates an axis from its value in words such as rot_obj=90."""
+
+
+def machine_names(typed: str) -> list[str]:
+    """Propose machines that ship with flexdt."""
+    from flexdt.twin.machine.description import builtin_machines
+
+    return _beginning(typed, builtin_machines())
+
+
+def profile_names(typed: str) -> list[str]:
+    """Propose profiles of zero offsets that ship with flexdt."""
+    from flexdt.twin.machine.description import builtin_profiles
+
+    return _beginning(typed, builtin_profiles())
+
+
+def sample_names(typed: str) -> list[str]:
+    """Propose phantoms that ship with flexdt."""
+    from flexdt.phantoms import phantom_names
+
+    return _beginning(typed, phantom_names())
+
+
+def material_names(typed: str) -> list[str]:
+    """Propose materials of the table."""
+    from flexdt.phantoms.materials import materials
+
+    return _beginning(typed, materials())
+
+
+def axis_names(typed: str) -> list[str]:
+    """Propose axes of the configured machine."""
+    return _beginning(typed, _axes())
+
+
+def axis_values(typed: str) -> list[str]:
+    """Propose axes of the configured machine, each with the sign before its value."""
+    return _beginning(typed, (name + AXIS_VALUE for name in _axes()))
+
+
+def mode_names(typed: str) -> list[str]:
+    """Propose camera modes of the configured machine."""
+    from flexdt.library.machines import machine
+
+    return _beginning(typed, machine(None).detector.mode_names)
+
+
+def _axes() -> list[str]:
+    from flexdt.library.machines import machine
+
+    found = machine(None)
+    return [*found.axes, *found.virtual_axes]
+
+
+def _beginning(typed: str, names: Iterable[str]) -> list[str]:
+    """List the names that begin with what was typed; upper and lower case do not matter."""
+    return [name for name in names if name.lower().startswith(typed.lower())]

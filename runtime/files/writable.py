@@ -1,0 +1,30 @@
+"""Try an output path before the work whose result goes there."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+
+def require_writable(path: Path | None) -> None:
+    """Refuse an output path that cannot be written.
+
+    A file without a name is made in the folder, or in the nearest one above it that exists, and is
+    gone at once.
+
+    Args:
+        path: of a file or a folder that need not exist; None is no output.
+
+    Raises:
+        OSError: names `path`, and the system's reason.
+    """
+    if path is None:
+        return
+    folder = path if path.is_dir() else path.absolute().parent
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise type(error)(error.errno, error.strerror, str(path)) from None
