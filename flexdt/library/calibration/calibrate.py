@@ -15,6 +15,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
+from html import escape
 from itertools import groupby
 from os import PathLike
 from pathlib import Path
@@ -35,6 +36,7 @@ from flexdt.library.calibration.markers import (
 )
 from flexdt.library.calibration.square_pixels import squared
 from flexdt.library.datasets.image_set import Images, Images_co, ImageSet
+from flexdt.library.datasets.notebook_html import values_table
 from flexdt.phantoms import Phantom, load_phantom
 from flexdt.phantoms.files.phantom_files import read_phantom_file
 from flexdt.twin import long_work
@@ -75,8 +77,23 @@ class Outcome(Generic[Images_co]):
         asked = sum(bool(p["asked"]) for p in self.parameters.values())
         return (
             f"<Calibration with {self.phantom.name!r}: {asked} parameters from "
-            f"{d['frames']} frames, rms {d['rms_px']:.4f} px>"
+            f"{d['frames']} frames, rms {d['rms_px']:.4f} px. {self.verdict}>"
         )
+
+    def _repr_html_(self) -> str:
+        """Show the verdict, and the parameters with their standard deviations."""
+        heads = ("parameter", "value", "sigma", "unit")
+        rows = (
+            (name, _digits(found["value"]), _digits(found["sigma"]), found["unit"])
+            for name, found in self.parameters.items()
+            if found["asked"]
+        )
+        return f"<p><b>{escape(self.verdict)}</b></p>{values_table(heads, rows)}"
+
+    @property
+    def verdict(self) -> str:
+        """What the calibration may be used for, in a sentence or two."""
+        return str(self.document["verdict"])
 
     @property
     def parameters(self) -> Mapping[str, Mapping[str, object]]:
@@ -117,6 +134,11 @@ class Outcome(Generic[Images_co]):
             f"{self.phantom.name}, {len(result.scans)} scan(s), rms {rms:.4f} px",
             result.panel,
         )
+
+
+def _digits(value: object) -> str:
+    """Write a number with five digits; "-" where it must not be used."""
+    return f"{value:.5g}" if isinstance(value, float | int) else "-"
 
 
 def calibrate_with(

@@ -16,6 +16,7 @@ from typing import Any, Final, Protocol, Self, TypeVar, overload
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.library.datasets.notebook_html import facts_table, thumbnail
 from flexdt.runtime.files.dataset_folder import Frame, mean_image, read_image
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetMissingError
 from flexdt.twin.dataset.flexdt_json import DatasetDocument
@@ -226,6 +227,21 @@ class ImageSet:
         return (
             f"<DataSet {self.name!r}: {len(self)} projections of {rows} x {cols}, {state}{doubts}>"
         )
+
+    def _repr_html_(self) -> str:
+        """Show what a reader wants to know first, and the first image."""
+        rows, cols = self.shape
+        facts = {
+            "projections": f"{len(self)} of {rows} x {cols} pixels",
+            "complete": "yes" if self.complete else "no",
+            "dark, flat images": f"{len(self.darks)}, {len(self.flats)}",
+            **{f"warning {i}": text for i, text in enumerate(self.warnings, 1)},
+        }
+        picture = ""
+        if self.present:
+            first = self.present[0]
+            picture = thumbnail(self.counts(first), f"projection {first}")
+        return facts_table(f"DataSet {self.name}", facts) + picture
 
     @overload
     def __getitem__(self, index: int) -> Float32Array: ...
