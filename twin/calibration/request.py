@@ -5,16 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.diagnose.fitted import (
     MISFIT_PX,
 )
-from flexdt.twin.calibration.fit.priors import ASSUMED, known, require_widths
+from flexdt.twin.calibration.fit.priors import known, known_strain, require_widths
 from flexdt.twin.calibration.fit.problem import (
     SIX,
-    UNSTRAINED,
     Reading,
     Strain,
     require_names,
@@ -30,11 +27,6 @@ from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 
 ANYWHERE = 1e3
 """A prior [mm, deg] so wide that the images alone say where its parameter is."""
-
-
-STRAIN = 1e-3
-"""Standard deviation of the stretches and the shears of a phantom that states no
-tolerance; assumed: printed plastic shrinks by that and more."""
 
 
 @dataclass(frozen=True)
@@ -108,21 +100,8 @@ def stated_priors(scans: Sequence[Scan], request: CalibrationRequest) -> dict[st
 
 
 def strain_prior(model: BeadModel, request: CalibrationRequest) -> Strain:
-    """Give the standard deviations of the phantom's stretches and shears [1].
-
-    It is 0 where beads are exactly where the phantom says (`bead_tolerance_mm` 0, or every offset
-    of the scanner stated as exact), or are unknowns themselves; less than STRAIN where the
-    phantom's own tolerance is.
-    """
-    if request.bead_tolerance_mm is not None:
-        return UNSTRAINED
-    if all(request.priors.get(name) == 0.0 for name in ASSUMED if name not in request.free):
-        return UNSTRAINED
-    reach = float(np.sqrt(np.mean(np.sum(model.beads**2, axis=1))))
-    if not model.tolerance_mm > 0 or not reach > 0:
-        return STRAIN, STRAIN
-    width = min(STRAIN, model.tolerance_mm / reach)
-    return width, width
+    """Give the standard deviations of the phantom's stretches and shears [1]."""
+    return known_strain(model, request.bead_tolerance_mm, request.priors, request.free)
 
 
 def with_free(request: CalibrationRequest, names: Sequence[str]) -> CalibrationRequest:

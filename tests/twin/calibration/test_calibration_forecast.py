@@ -12,9 +12,10 @@ import pytest
 from flexdt.phantoms import load_phantom, spiral_positions
 from flexdt.twin.calibration import SIX, BeadModel, FitResult, estimate_geometry, identifiability
 from flexdt.twin.calibration.fit.fit import image_quantities
-from flexdt.twin.calibration.fit.priors import Given, exact, known
+from flexdt.twin.calibration.fit.priors import Given, exact, known, known_strain
 from flexdt.twin.calibration.frame_source import ArrayFrames
 from flexdt.twin.calibration.pipeline import CalibrationRequest, Scan, calibrate
+from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
 
 FRAMES = 36
@@ -35,7 +36,9 @@ def beads_of(kind: str) -> npt.NDArray[np.float64]:
 
 
 def assert_as_forecast(fit: FitResult, model: BeadModel, priors: Given | None) -> None:
-    forecast = identifiability(model, POSES, fit.certificate.rms_px, shape=own.SHAPE, priors=priors)
+    at = Offsets.from_edge(TRUTH)
+    noise = fit.certificate.rms_px
+    forecast = identifiability(model, POSES, noise, shape=own.SHAPE, priors=priors, at=at)
     for name in SIX:
         assert forecast.sigmas[name] == pytest.approx(fit.sigmas[name], rel=AGREE), name
     (seen,) = image_quantities(fit)
@@ -51,7 +54,10 @@ def test_points(kind: str, priors: Given | None) -> None:
     tracks = own.pixels(beads, ANGLES, own.SOD, TRUTH)
     tracks = tracks + rng.normal(0, own.NOISE_PX, tracks.shape)
     model = BeadModel(beads, np.full(len(beads), own.RADIUS))
-    fit = estimate_geometry(tracks, model, POSES, shape=own.SHAPE, priors=known(given=priors))
+    fit = estimate_geometry(
+        tracks, model, POSES, shape=own.SHAPE, priors=known(given=priors),
+        strain=known_strain(model, given=priors),
+    )  # fmt: skip
     assert_as_forecast(fit, model, priors)
 
 

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model, spot_radii
 from flexdt.twin.calibration.fit.certificate import Conditioning, spectrum
 from flexdt.twin.calibration.fit.fit import IN_IMAGES, image_slopes
-from flexdt.twin.calibration.fit.priors import NOISE_PX, Given, known
+from flexdt.twin.calibration.fit.priors import NOISE_PX, Given, known, known_strain
 from flexdt.twin.calibration.fit.problem import (
     SIX,
     FitProblem,
@@ -95,7 +95,7 @@ def identifiability(
     *,
     shape: Shape = None,
     at: Offsets = NOMINAL,
-    bead_tolerance_mm: float = 0.0,
+    bead_tolerance_mm: float | None = None,
     priors: Given | None = None,
     bound: float = BOUND,
 ) -> Prediction:
@@ -109,7 +109,9 @@ def identifiability(
         shape: detector (rows, cols); None is the default machine's camera. Beads that would not
             lie wholly on it do not count.
         at: the geometry to predict at.
-        bead_tolerance_mm: > 0: bead positions are unknowns with this prior.
+        bead_tolerance_mm: > 0: bead positions are unknowns with this prior. 0: they are exactly
+            where the phantom says. None: the phantom as a whole is strained a little, as `flexdt
+            calibrate` assumes.
         priors: what is known of other offsets [mm, deg, 1], in place of what `flexdt calibrate`
             assumes of a scanner that states nothing; 0 is exactly, "none" is all exactly.
         bound: sigma [mm, deg] beyond which a direction counts as not determined.
@@ -133,7 +135,7 @@ def identifiability(
     >>> identifiability(bead_phantom("normal", 1), poses, shape=(760, 956)).identifiable
     False
     """
-    require_tolerance(bead_tolerance_mm)
+    tolerance = require_tolerance(bead_tolerance_mm or 0.0)
     model = bead_model(phantom)
     poses = as_poses(geometry)
 
@@ -148,8 +150,8 @@ def identifiability(
         tracks = np.where(visible[..., None], pixels + origin[:, None], np.nan)
         problem = build_problem(
             tracks, beads, plan, free=free, shape=sizes, noise_px=noise_px,
-            free_beads=bead_tolerance_mm > 0, start=at, bead_tolerance_mm=bead_tolerance_mm,
-            priors=widths,
+            free_beads=tolerance > 0, start=at, bead_tolerance_mm=tolerance, priors=widths,
+            strain=known_strain(beads, bead_tolerance_mm, priors, free),
         )  # fmt: skip
         return forecast(problem, bound), visible
 
@@ -207,9 +209,10 @@ def forecast(problem: FitProblem, bound: float = BOUND) -> Forecast:
     seen = int(problem.seen.any(axis=0).sum())
     rows = np.concatenate([problem.jacobian(problem.start), np.diag(1.0 / problem.prior_sigma)])
     spec = spectrum(rows, names, seen, reported=count, bound=bound)
-    if count < reported:
+    strained = range(problem.layout.bead_columns.stop, problem.layout.panel_column)
+    if count < reported or strained:
         # Rank and condition say what the images tell of what was asked for, all else given.
-        given = [i for i in range(len(names)) if not count <= i < reported]
+        given = [i for i in range(len(names)) if not count <= i < reported and i not in strained]
         alone = spectrum(rows[:, given], [names[i] for i in given], seen, reported=count)
         rank = min(alone.rank, len(given) - len(spec.null))
         unit = spec.unit_covariance

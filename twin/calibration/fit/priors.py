@@ -13,7 +13,10 @@ import math
 from collections.abc import Container, Iterable, Mapping
 from typing import Final, Literal
 
-from flexdt.twin.calibration.fit.problem import SIX, require_names
+import numpy as np
+
+from flexdt.twin.calibration.bead_model import BeadModel
+from flexdt.twin.calibration.fit.problem import SIX, UNSTRAINED, Strain, require_names
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.offsets import UNITS
 from flexdt.twin.machine.description import Machine, Profile
@@ -29,6 +32,9 @@ FIXED: Final[Mapping[str, float]] = dict.fromkeys(SIX, 0.3)
 """The same for what the operator chooses, where it is not to be estimated: read from motors and a
 mount, it is not exact either."""
 
+STRAIN: Final = 1e-3
+"""Standard deviation of the scale, the stretches and the shears of a phantom that states no
+tolerance; assumed: printed plastic shrinks by that and more."""
 NOISE_PX: Final = 0.1
 """Standard deviation of a detected coordinate in forecasts, assumed: images of a good exposure tell
 it twenty times better, which priors hide in the offsets and which shows in the image."""
@@ -63,6 +69,29 @@ def known(
                 out[name] = max(out.get(name, 0.0), width)
     own = require_widths(given or {})
     return out | {n: w for n, w in own.items() if w > 0 or n not in free}
+
+
+def known_strain(
+    model: BeadModel,
+    bead_tolerance_mm: float | None = None,
+    given: Given | None = None,
+    free: Container[str] = SIX,
+) -> Strain:
+    """Give what is known of the phantom's shape: standard deviations of stretches and shears [1].
+
+    They are 0 where the beads are exactly where the phantom says (a tolerance of 0, or every
+    offset of the scanner stated as exact) or are unknowns themselves (a tolerance above 0), and
+    less than STRAIN where the phantom's own tolerance is.
+    """
+    if bead_tolerance_mm is not None or given == "none":
+        return UNSTRAINED
+    if given and all(given.get(name) == 0.0 for name in ASSUMED if name not in free):
+        return UNSTRAINED
+    reach = float(np.sqrt(np.mean(np.sum(model.beads**2, axis=1))))
+    if not model.tolerance_mm > 0 or not reach > 0:
+        return STRAIN, STRAIN
+    width = min(STRAIN, model.tolerance_mm / reach)
+    return width, width
 
 
 def exact(free: Container[str] = SIX) -> dict[str, float]:

@@ -140,8 +140,8 @@ def require_names(names: Iterable[str]) -> None:
             raise UnknownNameError.among(f"unknown parameter {name!r}; allowed", name, NAMES)
 
 
-def require_tolerance(tolerance_mm: float) -> None:
-    """Check a standard deviation of bead positions.
+def require_tolerance(tolerance_mm: float) -> float:
+    """Return a standard deviation of bead positions if it is one.
 
     Raises:
         TwinError: negative, infinite or not a number.
@@ -152,6 +152,7 @@ def require_tolerance(tolerance_mm: float) -> None:
             "or more",
             {"asked": tolerance_mm, "allowed": ">= 0"},
         )
+    return tolerance_mm
 
 
 def layout(
