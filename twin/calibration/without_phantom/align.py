@@ -24,7 +24,6 @@ from flexdt.twin.calibration.without_phantom.alignment import (
 )
 from flexdt.twin.calibration.without_phantom.circular_scan import FREE, OF_TURN, CircularScan
 from flexdt.twin.calibration.without_phantom.symmetry_plane import SymmetryPlane, find_plane
-from flexdt.twin.calibration.without_phantom.tile_gap import Gap
 from flexdt.twin.calibration.without_phantom.turn import Image, Turn
 from flexdt.twin.calibration.without_phantom.turn_planes import TurnPlanes
 from flexdt.twin.errors import NotIdentifiableError
@@ -104,7 +103,7 @@ def align_turn(
             motion = _motion(planes, plane.turn, corrected, random)
         except NotIdentifiableError as error:
             refused["motion"] = error.message
-    warnings = _warnings(plane.turn, plane.gap, len(poses) - len(present))
+    warnings = _warnings(plane, plane.turn, len(poses) - len(present))
     used = len(plane.turn.used)
     return Alignment(corrected, parameters, refused, warnings, used, motion, plane.panel)
 
@@ -148,12 +147,14 @@ def _motion(
     return planes.motion(corrected, random)
 
 
-def _warnings(turn: Turn, gap: Gap | None, missing: int) -> tuple[str, ...]:
+def _warnings(plane: SymmetryPlane, turn: Turn, missing: int) -> tuple[str, ...]:
     """Say what is doubtful about the scan."""
     out = []
-    if gap is not None:
+    if plane.opposite is not None and plane.opposite.warning is not None:
+        out.append(plane.opposite.warning)
+    if plane.gap is not None:
         out.append(
-            f"{gap.text}: it is closed in what is told here, its uncertainty is in the axis "
+            f"{plane.gap.text}: it is closed in what is told here, its uncertainty is in the axis "
             "column's sigma, and reconstruct closes it with the correction"
         )
     if turn.repeated:

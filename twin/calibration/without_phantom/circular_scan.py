@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -76,11 +76,22 @@ class CircularScan:
         """Give the cone_vec row (12,) of the shared pose about the axis."""
         return np.asarray(about_axis(self.pose, self.offsets(values)).rows[0])
 
-    def column(self, values: FloatArray) -> float:
-        """Give the column in which the axis crosses the panel's middle row [px]."""
+    def column(self, values: FloatArray, row: float | None = None) -> float:
+        """Give the column in which the axis crosses a row, the panel's middle one if None [px]."""
         rows, cols = self.shape
-        middle = np.array([(cols - 1) / 2, (rows - 1) / 2])
+        middle = np.array([(cols - 1) / 2, (rows - 1) / 2 if row is None else row])
         return float(axis_in_image(self.pose, self.offsets(values), middle)[0])
+
+    def azimuth(self, frames: Sequence[int]) -> FloatArray:
+        """Give the angle about the axis at which the source stands in frames, (n,) [rad]."""
+        source = about_axis(self.poses[np.array(frames)], self.offsets(self.start)).source
+        return np.asarray(np.arctan2(source[:, 1], source[:, 0]))
+
+    def source_row(self) -> float:
+        """Give the row of the plane in which the source turns, by the offsets in force."""
+        shown = about_axis(self.pose, self.offsets(self.start))
+        level = [[0.0, 0.0, float(shown.source[0, 2])]]
+        return float(shown.project_points(level, self.shape)[0, 0, 1])
 
     def slopes(self, values: FloatArray, scales: FloatArray) -> FloatArray:
         """Give the change of the column with each parameter, (k,)."""

@@ -8,7 +8,10 @@ differ from their opposites by the little that they lean, so rows near it count 
 The estimate is the root of Z' W r: r is the difference of the two, Z its slopes, freed of what a
 flat field that is wrong by a polynomial would add. Noise is in Z too; what an image of noise alone
 gives is taken from Z' W Z, which would promise too much. Sums over all rays of a view, of a sector
-of views and of a few columns tell how much Z' W r scatters: noise, rings, jitter, sampling.
+of views and of a few columns tell how much Z' W r scatters: noise, rings, jitter, sampling. Both
+ends of a ray also differ by what repeats along a wire (it hardens the beam, and is wider from one
+end than from the other): what of r is no noise is taken to be as one with Z within a patch of some
+columns and a sector of views, which is the most that it can do.
 """
 
 from __future__ import annotations
@@ -42,6 +45,9 @@ LIFT: Final = 0.25
 at the edge of the field of view [px]."""
 EDGE: Final = 2
 """Rows around each view's that a cubic spline needs."""
+PATCH, SECTORS = 6.0, 24
+"""Sigmas of the smoothing that a patch of like differences is wide, in columns of both ends, and
+sectors of the views that are as many patches."""
 CLEAN: Final = 0.5
 """What the slopes are made of must be so many times noise, at least."""
 
@@ -183,6 +189,10 @@ class _Level:
             inverse = np.linalg.inv(information + kappa * rays.known)
             step = -inverse @ (score + kappa * rays.known @ (values - rays.start))
             covariance = inverse @ (scatter + kappa**2 * rays.known) @ inverse
+            mismatch = self._mismatch(
+                slopes[0], np.square(rest) - np.square(noise), w, pairs, values
+            )
+            covariance[0, 0] += (mismatch * inverse[0, 0]) ** 2
             longest = float(np.abs(step / rays.scales).max())
             values = values + step * min(1.0, 4.0 * self.sigma / max(longest, 1e-30))
             sigmas = np.sqrt(np.abs(np.diag(covariance)))
@@ -222,6 +232,30 @@ class _Level:
         self.structure = max(float((w * np.square(both - np.average(both))).sum()) / 2, 1e-30)
         rest, noise = freed(both[0] - both[1]), freed(difference(self.alone, places))
         return rest, freed(slopes[0]), noise, freed(slopes[1]), w
+
+    def _mismatch(
+        self, slope: FloatArray, excess: FloatArray, w: FloatArray,
+        pairs: npt.NDArray[np.intp], values: FloatArray,
+    ) -> float:  # fmt: skip
+        """Give what differences that are no noise add to a sum of them times slopes, at most
+        within a patch (Cauchy-Schwarz), at random from patch to patch.
+
+        Args:
+            slope: of the differences with the column, (m,).
+            excess: squares of the differences less those of noise, (m,).
+            w: weights, (m,).
+            pairs: of views, (q, 2).
+            values: parameters, (k,).
+        """
+        column = self.rays._places(values, pairs)[0][:, 0]
+        near = ((column[0] - column[1]) / (PATCH * self.sigma)).astype(np.intp)
+        sector = pairs[:, 0] * SECTORS // len(self.rays.frames)
+        patch = (near - near.min()) * SECTORS + sector
+        power, own = (
+            np.bincount(patch, (w * one).reshape(len(pairs), -1).sum(axis=1))
+            for one in (excess, np.square(slope))
+        )
+        return math.sqrt(float((own * power.clip(0.0)).sum()))
 
     def _scatter(
         self, slopes: FloatArray, rest: FloatArray, pairs: npt.NDArray[np.intp], values: FloatArray

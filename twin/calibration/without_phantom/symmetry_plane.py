@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +19,8 @@ from flexdt.twin.calibration.without_phantom.circular_scan import (
     CircularScan,
     about_axis,
 )
+from flexdt.twin.calibration.without_phantom.conjugate_rays import ConjugateRays
+from flexdt.twin.calibration.without_phantom.gap_evidence import SIGMAS, find_gap
 from flexdt.twin.calibration.without_phantom.mirror_symmetry import (
     REACH,
     Symmetry,
@@ -26,7 +28,7 @@ from flexdt.twin.calibration.without_phantom.mirror_symmetry import (
     first_column,
 )
 from flexdt.twin.calibration.without_phantom.opposite_rays import OppositeRays
-from flexdt.twin.calibration.without_phantom.tile_gap import Gap, find_gap
+from flexdt.twin.calibration.without_phantom.tile_gap import Gap
 from flexdt.twin.calibration.without_phantom.turn import Turn, read_turn
 from flexdt.twin.errors import NotIdentifiableError
 from flexdt.twin.geometry.conventions import FloatArray
@@ -44,10 +46,12 @@ MOST_COLUMN: Final = 2.0
 """Largest sigma of the column that is offered [px]."""
 MOST_ROLL: Final = 0.5
 """Largest sigma of the roll that is offered [deg]."""
-FLOOR_PX: Final = 0.01
-"""Added to the column's sigma: what beam hardening and lag do to the mean (assumed) [px]."""
 FLOOR_DEG: Final = 0.001
-"""The same for the roll [deg]."""
+"""Added to the roll's sigma: what beam hardening and lag do to the mean (assumed) [deg]."""
+APART_SIGMAS: Final = 4.0
+"""From here on a difference between the mean and opposite rays is a warning."""
+LEAST_APART_PX: Final = 0.1
+"""A smaller one is none, however well both are known: no volume shows it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +79,40 @@ class FirstColumn:
     preface: str
 
 
+class OppositeColumn(NamedTuple):
+    """What opposite rays say of the column beside the mean of a full turn.
+
+    Attributes:
+        apart_px: their column less that of the mean.
+        sigma_px: standard deviation of their column from leaving out sectors of the turn.
+        mean_sigma_px: that of the column of the mean before they are looked at.
+    """
+
+    apart_px: float
+    sigma_px: float
+    mean_sigma_px: float
+
+    @property
+    def floor_px(self) -> float:
+        """Give what the mean's sigma lacks, as far as opposite rays know it."""
+        if not math.isfinite(self.sigma_px):
+            return self.mean_sigma_px
+        share = self.mean_sigma_px / math.hypot(self.mean_sigma_px, self.sigma_px)
+        return share * math.hypot(self.apart_px, self.sigma_px)
+
+    @property
+    def warning(self) -> str | None:
+        """Say that the two disagree; None where they do not."""
+        sigma = math.hypot(self.mean_sigma_px, self.sigma_px)
+        if not abs(self.apart_px) > max(APART_SIGMAS * sigma, LEAST_APART_PX):
+            return None
+        return (
+            f"opposite rays put the axis {self.apart_px:+.3f} +- {self.sigma_px:.2g} px beside the "
+            f"column of the mean, {abs(self.apart_px) / sigma:.1f} sigma apart: something differs "
+            "between views; the column's sigma contains it"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class SymmetryPlane:
     """The plane of symmetry, with what else the images show of the scan.
@@ -90,6 +128,7 @@ class SymmetryPlane:
         column_sigma_px: standard deviation of the column.
         gap: between two tiles of the panel.
         panel: the distortion that was undone, the gap in it.
+        opposite: what opposite rays of a full turn say of the column.
     """
 
     scan: CircularScan
@@ -102,6 +141,7 @@ class SymmetryPlane:
     column_sigma_px: float
     gap: Gap | None
     panel: Panel | None
+    opposite: OppositeColumn | None = None
 
     @property
     def sigmas_deg(self) -> tuple[float, float]:
@@ -125,10 +165,12 @@ def find_plane(
     """
     first = _first_column(scan, random)
     _require_one_column(scan, first)
-    gap = _gap(first, panel)
-    if gap is not None:
-        first = _with_gap(first, gap)
+    gap = _gap(scan, first, panel)
+    whole, first = first, first if gap is None else _with_gap(first, gap)
     found = _fit(scan, first, gap)
+    if gap is not None and _closes(found, gap):
+        gap, first = None, whole
+        found = _fit(scan, first, gap)
     _require_symmetric(found, first.preface)
     plane = _plane(scan, first, found, gap, panel)
     _require_precise(plane, first.preface)
@@ -138,7 +180,8 @@ def find_plane(
 def _first_column(scan: CircularScan, random: np.random.Generator) -> FirstColumn:
     """Search for the axis in the mean over a full turn, without one in opposite rays."""
     try:
-        turn = read_turn(scan.image, scan.base.angle_scale * scan.poses.angle, scan.present)
+        angle = scan.base.angle_scale * scan.poses.angle
+        turn = read_turn(scan.image, angle, scan.present, source_row=scan.source_row())
     except NotIdentifiableError as error:
         why = error
     else:
@@ -195,12 +238,21 @@ def _require_one_column(scan: CircularScan, first: FirstColumn) -> None:
     )
 
 
-def _gap(first: FirstColumn, panel: Panel | None) -> Gap | None:
+def _gap(scan: CircularScan, first: FirstColumn, panel: Panel | None) -> Gap | None:
     """Look for a gap between two tiles that is not undone already."""
     if first.turn is None:
         return None
     borders = panel.model.borders if panel else ()
-    return find_gap(first.turn.samples, first.column, [b.at for b in borders if b.axis == 0])
+    closed = [b.at for b in borders if b.axis == 0]
+    rays = ConjugateRays.of(scan, first.turn)
+    return find_gap(rays, first.values, first.turn.samples, closed)
+
+
+def _closes(found: Symmetry, gap: Gap) -> bool:
+    """Say whether the plane of symmetry tells the width, and leaves nothing of a gap."""
+    sigma = float(np.sqrt(found.covariance[-1, -1]))
+    told = sigma < gap.sigma / 2
+    return found.converged and told and not found.values[-1] > SIGMAS * sigma
 
 
 def _with_gap(first: FirstColumn, gap: Gap) -> FirstColumn:
@@ -263,14 +315,36 @@ def _plane(
         told[:], beside = False, _beside_rows(scan, first.rays, first.priors[1])
         _keep_roll(values, covariance, scan.base.det_roll, first.priors[1])
     step = (0.0, 0.0) if turn is None else turn.step_px
-    covariance[0, 0] += (math.hypot(FLOOR_PX, step[0] / 2, beside) * scales[0]) ** 2
+    opposite = _opposite_column(scan, first, values, covariance, gap)
+    floor = opposite.floor_px if opposite else 0.0
+    covariance[0, 0] += (math.hypot(floor, step[0] / 2, beside) * scales[0]) ** 2
     covariance[1, 1] += math.radians(FLOOR_DEG) ** 2 + (step[0] / scan.shape[0]) ** 2
     slopes = scan.slopes(values, scales)
     sigma = math.sqrt(slopes @ covariance @ slopes)
     return SymmetryPlane(
         scan, turn, values, covariance, found.images[1:3], first.priors[1:3], told, sigma, gap,
-        panel,
+        panel, opposite,
     )  # fmt: skip
+
+
+def _opposite_column(
+    scan: CircularScan,
+    first: FirstColumn,
+    values: FloatArray,
+    covariance: FloatArray,
+    gap: Gap | None,
+) -> OppositeColumn | None:
+    """Compare the column of the mean with that of opposite rays; None without a full turn."""
+    if first.turn is None:
+        return None
+    rays = ConjugateRays.of(scan, first.turn)
+    if gap is not None:
+        rays = rays.closed(gap.column, gap.width)
+    slopes = scan.slopes(values, first.scales[: len(values)])
+    own = math.sqrt(slopes @ covariance @ slopes)
+    moved, sigma = rays.column(values)
+    apart = scan.column(moved, rays.row) - scan.column(values, rays.row)
+    return OppositeColumn(apart, sigma, own)
 
 
 def _closed(scan: CircularScan, turn: Turn, gap: Gap) -> tuple[CircularScan, Turn]:

@@ -1,4 +1,4 @@
-"""A gap between two tiles of the panel, found in some of the frames of a turn.
+"""What single frames of a turn show of a gap between two tiles of the panel.
 
 What lies in a gap is missing: beyond it everything appears nearer by its width, and the columns
 beside it differ as columns do that are further apart. How much columns differ with their distance
@@ -25,7 +25,6 @@ from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import maximum_filter1d, median_filter
 
 from flexdt.twin.dataset.normalise import binned_mean
-from flexdt.twin.errors import NotIdentifiableError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.panel import Border, Panel
 
@@ -71,22 +70,19 @@ def averaged_rows(image: Float32Array) -> Float32Array:
     return binned_mean(image, (-(-len(image) // ROWS), 1))
 
 
-def find_gap(
+def local_gaps(
     frames: Sequence[Float32Array], axis: float, closed: Sequence[float] = ()
-) -> Gap | None:
-    """The gap that stands out, if there is one.
+) -> list[Gap]:
+    """Give the border, or the two, whose likelihood of a gap stands out.
 
     Args:
         frames: line integrals of `averaged_rows`, some of a turn.
         axis: column of the axis, to a pixel or two.
         closed: columns of borders beside which the images are filled in.
-
-    Raises:
-        NotIdentifiableError: two stand out.
     """
     stack = np.asarray(frames, dtype=np.float64)
     if stack.shape[2] < 8 * SIDE:
-        return None
+        return []
     table = (stack - stack.mean(axis=0)).reshape(-1, stack.shape[2])
     spread = table.std(axis=0)
     dead = spread < 0.1 * median_filter(spread, 4 * SIDE + 1)
@@ -98,7 +94,7 @@ def find_gap(
     power[:, np.lib.stride_tricks.sliding_window_view(dead, 2 * SIDE).any(axis=1)] = 0.0
     row, border = np.nonzero(power > np.quantile(power, 1.0 - EDGES))
     if not len(row):
-        return None
+        return []
     edges = around[row, border] / np.sqrt(power[row, border])[:, None]
     places, of_frame = power.shape[1], row // stack.shape[1]
     gains = _gains(edges, of_frame * places + border, (len(stack), places))
@@ -110,19 +106,16 @@ def find_gap(
     best = int(gain.argmax())
     others = np.where(np.abs(place - best) > SIDE, gain, 0.0)
     second = int(others.argmax())
+    standing = [best]
     if gain[best] < max(EVIDENCE, STANDS_OUT * others[second]):
         third = float(others[np.abs(place - second) > SIDE].max())
-        if others[second] < max(EVIDENCE, STANDS_OUT * third):
-            return None
-        both = sorted((best + SIDE, second + SIDE))
-        raise NotIdentifiableError(
-            f"from columns {both[0]} and {both[1]} on everything appears nearer, as behind two "
-            "gaps between tiles of the panel, of which one can be found; calibrate with a phantom, "
-            "and give that correction"
-        )
-    width = float(WIDTHS[gains[:, best].argmax()])
-    # Sharper edges than the usual ones look like a wider gap: drawn ones are off by half of that.
-    return Gap(best + SIDE, width, 0.2 + 0.3 * width)
+        standing = [best, second] if others[second] >= max(EVIDENCE, STANDS_OUT * third) else []
+    found = []
+    for one in standing:
+        width = float(WIDTHS[gains[:, one].argmax()])
+        # Sharper edges than the usual ones look like a wider gap: drawn ones are off by half of it.
+        found.append(Gap(one + SIDE, width, 0.2 + 0.3 * width))
+    return found
 
 
 def _gains(edges: FloatArray, place: npt.NDArray[np.intp], shape: tuple[int, int]) -> FloatArray:

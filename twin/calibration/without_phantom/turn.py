@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -45,6 +46,11 @@ BACK: Final = 0.3
 """Two steps whose sum is smaller than so much of one are one to and fro (assumed)."""
 WIDEST_GAP: Final = 4.5
 """Largest gap between neighbouring angles, relative to the usual one: three frames missing."""
+BAND, BAND_PART, GROUPS = 12, 20, 7
+"""Rows above and below the plane of the source that are kept, at least; columns over these rows;
+groups of rows. Rays further off lean too much to be each other's."""
+MOST_BANDS: Final = 1440
+"""Of more views every second, third and so on is kept."""
 GAP_IMAGES: Final = 6
 """Images in which the effect of gaps is kept; more gaps than that share them."""
 
@@ -62,6 +68,9 @@ class Turn:
         noise: relative variance of a pixel of `mean`, (rows, cols).
         used: indices of the frames in the mean.
         samples: some of these frames, their rows averaged: `averaged_rows`.
+        band: means over groups of rows near the plane of the source, (views, groups, cols).
+        band_rows: middle row of each group.
+        band_frames: frame of each of these views.
         repeated: indices of frames left out as repeated.
         step_px: (columns, rows) by which the images step at most between neighbouring frames; 0
             where no step is significant or none can be told.
@@ -73,6 +82,9 @@ class Turn:
     noise: FloatArray
     used: tuple[int, ...]
     samples: tuple[Float32Array, ...]
+    band: Float32Array
+    band_rows: tuple[float, ...]
+    band_frames: tuple[int, ...]
     repeated: tuple[int, ...]
     step_px: tuple[float, float]
     step_after: int
@@ -84,6 +96,7 @@ def read_turn(
     present: Sequence[int],
     repeated: tuple[int, ...] = (),
     lost: tuple[int, ...] = (),
+    source_row: float = 0.0,
 ) -> Turn:
     """Read the frames, twice where some are repeated.
 
@@ -93,6 +106,7 @@ def read_turn(
         present: indices of the frames that are there.
         repeated: frames among them that are known to be repeated.
         lost: frames before which one may be missing, although no angle is.
+        source_row: row of the plane in which the source turns.
 
     Raises:
         NotIdentifiableError: they are too few, or do not close a turn.
@@ -110,27 +124,41 @@ def read_turn(
             weights = np.vstack([weights, weights[0] * (near / near.sum() - gap)])
     total: FloatArray | float = 0.0
     noise: FloatArray | float = 0.0
-    used, thumbs, samples = tuple(sorted(kept)), [], []
+    used, thumbs, samples, bands = tuple(sorted(kept)), [], [], []
     sampled = set(used[:: -(-len(used) // FRAMES)])
+    stride = -(-len(index) // MOST_BANDS)
     for weight, i in zip(weights.T, index.tolist(), strict=True):
         g = image(i)
         thumbs.append(_thumb(g))
         if i in sampled:
             samples.append(averaged_rows(g))
+        if len(thumbs) % stride == 0:
+            groups = _groups(len(g), g.shape[1], source_row)
+            bands.append([g[top:end].mean(axis=0) for top, end in groups])
         total = total + weight[:, None, None] * g.astype(np.float64)
         noise = noise + weight[0] * np.exp(np.minimum(g, DARKEST))
     views = np.stack(thumbs)
     if not repeated:
         again, jumps = (index[places].tolist() for places in _repeated(views, gaps))
         if again:
-            return read_turn(image, angle, present, tuple(sorted(again)), tuple(jumps))
+            return read_turn(image, angle, present, tuple(sorted(again)), tuple(jumps), source_row)
     images, (rows, cols) = np.asarray(total), np.shape(noise)
     (right, down), after = _step(views, gaps, int(index.argmin()))
     step = right * cols / views.shape[2], down * rows / views.shape[1]
     return Turn(
-        images[0], images[1:], np.asarray(noise), used, tuple(samples), repeated, step,
-        int(index[after]),
+        images[0], images[1:], np.asarray(noise), used, tuple(samples),
+        np.asarray(bands, dtype=np.float32), tuple((top + end - 1) / 2 for top, end in groups),
+        tuple(index[stride - 1 :: stride].tolist()), repeated, step, int(index[after]),
     )  # fmt: skip
+
+
+def _groups(rows: int, cols: int, middle: float) -> list[tuple[int, int]]:
+    """Divide rows about the plane of the source into groups, (top, end) each."""
+    half = max(BAND, cols // BAND_PART)
+    centre = min(max(round(middle), min(half, rows // 2)), rows - 1 - min(half, (rows - 1) // 2))
+    top, end = max(0, centre - half), min(rows, centre + half + 1)
+    edges = np.linspace(top, end, min(GROUPS, end - top) + 1).round().astype(int).tolist()
+    return list(pairwise(edges))
 
 
 def _require_turn(angle: FloatArray) -> tuple[FloatArray, float]:

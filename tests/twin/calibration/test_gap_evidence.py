@@ -1,0 +1,62 @@
+"""A gap between tiles is told by both ends of rays: steps of drawn profiles, and natural objects
+of tests/studies/natural_objects.py, whose renderer shares nothing with what is tested."""
+
+from __future__ import annotations
+
+import natural_objects
+import numpy as np
+import pytest
+
+from flexdt.twin.calibration.without_phantom.conjugate_rays import Profile
+
+
+def profile(shift: np.ndarray, sigma: float, columns: int = 80) -> Profile:
+    """Make a profile of bins of 5 columns each, all of which tell as much."""
+    radius = np.arange(columns) + 0.5
+    place = np.arange(columns) // 5
+    return Profile.of(radius, np.ones(columns), place, shift, np.full(len(shift), sigma), 1.5)
+
+
+def test_steps_are_told_and_what_bends_or_scatters_is_not() -> None:
+    rng = np.random.default_rng(4)
+    middle = np.arange(16) * 5 + 2.5
+    told = 0
+    for _ in range(20):
+        sigma = rng.uniform(0.01, 0.1)
+        scatter = rng.normal(0, sigma * rng.choice([1, 3]), 16)
+        bent = rng.uniform(-0.3, 0.3) * middle / 80 + rng.uniform(-0.3, 0.3) * (middle / 80) ** 2
+        lump = rng.uniform(-1, 1) * np.exp(-np.square((middle - rng.uniform(20, 60)) / 6))
+        for shape in (0.0, bent, lump):
+            assert not profile(scatter + shape, sigma).best().significant
+        border, width = rng.uniform(15, 65), rng.choice([-1, 1]) * rng.uniform(0.8, 2)
+        stepped = scatter + width * np.clip((middle - border) / 5 + 0.5, 0, 1)
+        step = profile(stepped, sigma).best()
+        told += step.significant
+        assert abs(step.width - width) < 5 * step.sigma + 0.15 * abs(width)
+        assert abs(step.radius - border) < 6 or not step.significant
+    assert told >= 18
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", list(natural_objects.OBJECTS))
+@pytest.mark.campaign(3)
+def test_natural_objects_have_no_gap(kind: str) -> None:
+    for seed in (31, 32):
+        told = natural_objects.tried(kind, seed, gap=False)
+        assert not told["named"], told
+        assert not told["repeats"], told
+        assert abs(told.get("pull", 0.0)) < 4, told
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["foam", "board", "printed", "stone"])
+@pytest.mark.campaign(2)
+def test_gaps_behind_natural_objects_are_named(kind: str) -> None:
+    told = natural_objects.tried(kind, 102, gap=True)
+    assert told["named"], told
+    assert abs(told.get("pull", 0.0)) < 4, told
+
+
+@pytest.mark.slow
+def test_fans_of_wires_that_harden_the_beam_are_within_their_sigma() -> None:
+    assert natural_objects.main(["--fans", "--count", "8", "--seed", "1"]) == 0

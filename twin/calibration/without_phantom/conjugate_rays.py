@@ -1,0 +1,370 @@
+"""Rays that a full turn shows from both ends: the axis column by itself, and steps beside the axis.
+
+A ray of the source's plane that one view shows at an angle g to the ray through the axis is shown
+from its other end by the view half a turn and 2 g further, at the mirror image of its column. Both
+integrals are the same for any object, so both ends of all rays lie equally far from the axis. By
+how many pixels they do not, at each distance, is read from slopes of the images; the slope of one
+end is the instrument of the other, so that noise in slopes shortens nothing. What a column shows in
+all views alike (rings, a wrong flat field, a wall about the axis) is left out.
+
+A wrong axis column moves all distances alike. A gap between two tiles moves those beyond it by its
+width and no others, whatever passes there: it is an identity of the panel. What else differs from
+distance to distance (beam hardening at walls, a yaw, few views) is no step; how much that is says
+what a step must exceed.
+
+Uncertainties follow from leaving out sectors of the turn.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import gaussian_filter1d, map_coordinates, spline_filter
+from scipy.special import ndtr
+from scipy.stats import t as student
+
+from flexdt.twin.calibration.without_phantom.circular_scan import CircularScan
+from flexdt.twin.calibration.without_phantom.mirror_symmetry import mirror_map
+from flexdt.twin.calibration.without_phantom.turn import Turn
+from flexdt.twin.geometry.conventions import FloatArray
+
+SECTORS: Final = 24
+"""Sectors of the turn that are left out in turn."""
+SMOOTHING: Final = 128.0
+"""Columns over the smoothing's sigma, which is one column at least."""
+VIEWS_OVER: Final = 4.0
+"""The smoothing's sigma is this part of what the panel's width turns by between views, at least."""
+EDGE: Final = 8
+"""Views repeated at both ends for the splines over the angle."""
+ROUNDS: Final = 4
+"""Steps towards the axis column."""
+BINS: Final = 24
+"""Distances from the axis are taken together in up to so many bins."""
+WIDE: Final = 2.0
+"""A bin is so many sigmas of the smoothing wide, at least."""
+YAW_PX: Final = 0.1
+"""By so much a yaw may move the ends of the panel against its middle, beyond that in force [px]."""
+LEAST_BINS: Final = 8
+"""One bin of so many may be left out: where a wall turns back, more is wrong than elsewhere."""
+FEWEST_BINS: Final = 4
+"""Bins that tell something, at least."""
+BEYOND, BESIDE = 3, 2
+"""Whole bins beyond a step, at least, and beside it that are not left out."""
+WIDEST: Final = 5.0
+"""No gap is wider [px]."""
+ALIKE: Final = 0.3
+"""Slopes of both ends of rays must correlate so much: of noise alone they do not."""
+CHANCE: Final = 1e-4
+"""Probability of a step in a scan without one."""
+
+
+class Step(NamedTuple):
+    """A step of the distance between both ends of rays.
+
+    Attributes:
+        radius: distance from the axis beyond which rays are moved [px].
+        width: by how much [px]; positive: right of the axis, everything beyond appears nearer.
+        sigma: standard deviation of the width [px].
+        least: what the width must exceed to be no chance [px].
+    """
+
+    radius: float
+    width: float
+    sigma: float
+    least: float
+
+    @property
+    def significant(self) -> bool:
+        """Whether it is no chance."""
+        return abs(self.width) > self.least
+
+
+NO_STEP: Final = Step(0.0, 0.0, math.inf, math.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """Distances between both ends of rays, by their distance from the axis.
+
+    Attributes:
+        radii: where steps are looked for, (r,) [px].
+        basis: shares in bins of a common shift, of a yaw and of a step at radii, (r, m, 3).
+        shift: distance between the ends, of each bin, (m,) [px].
+        sigma: standard deviation of the shift by sectors of the turn, (m,) [px].
+    """
+
+    radii: FloatArray
+    basis: FloatArray
+    shift: FloatArray
+    sigma: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        radius: FloatArray,
+        weight: FloatArray,
+        place: npt.NDArray[np.intp],
+        shift: FloatArray,
+        sigma: FloatArray,
+        soft: float,
+    ) -> Profile:
+        """Look for steps at all columns but those of the last bins: of one bin beyond, a wall that
+        turns back there shows as much.
+
+        Args:
+            radius: of columns from the axis, (k,) [px].
+            weight: what they tell, (k,).
+            place: their bins, (k,).
+            shift, sigma: of the bins, (m,) [px].
+            soft: sigma of the smoothing [px].
+        """
+        at = radius[place <= place.max() - BEYOND]
+        return cls(at, _basis(radius, weight, place, at, soft), shift, sigma)
+
+    def best(self) -> Step:
+        """Give the step that is least a chance; up to a part of the bins, which fit it worst, left
+        out, and what that choice makes of chance in `least`."""
+        sigma, found = self.sigma, [NO_STEP]
+        border = np.abs(self.basis[:, :, 2] - 0.5).argmin(axis=1)
+        for _ in range(1 + len(self.shift) // LEAST_BINS):
+            chi_square = np.square(self._fit(sigma)[2]).sum(axis=1)
+            widened = self._widened(sigma, int(chi_square.argmin()))
+            steps, rest = self._steps(widened)
+            left_out = np.flatnonzero(np.isinf(sigma))
+            clear = (np.abs(border[:, None] - left_out) > BESIDE).all(axis=1)
+            narrow = clear & np.array([abs(one.width) < WIDEST for one in steps])
+            if not narrow.any():
+                break
+            ratio = np.where(narrow, [abs(one.width) / one.least for one in steps], 0.0)
+            found.append(steps[int(ratio.argmax())])
+            sigma = sigma.copy()
+            sigma[int(np.abs(rest[int(ratio.argmax())]).argmax())] = math.inf
+        return max(found, key=lambda one: abs(one.width) / one.least)
+
+    def at(self, radius: float) -> Step:
+        """Give the step at the radius next to one."""
+        place = int(np.abs(self.radii - radius).argmin())
+        return self._steps(self._widened(self.sigma, place))[0][place]
+
+    def _fit(self, sigma: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Fit steps: values (r, 3), their covariances, and what they leave in sigmas, (r, m)."""
+        scaled, aim = self.basis / sigma[:, None], self.shift / sigma
+        across = scaled.transpose(0, 2, 1)
+        inverse = np.linalg.inv(across @ scaled + np.diag([1e-9, 1.0, 1e-9]))
+        values = (inverse @ (across @ aim)[:, :, None])[:, :, 0]
+        rest = aim - (scaled @ values[:, :, None])[:, :, 0]
+        return values, np.asarray(inverse, dtype=np.float64), rest
+
+    def _steps(self, sigma: FloatArray) -> tuple[list[Step], FloatArray]:
+        """Give the steps at all radii, and what they leave in sigmas, (r, m)."""
+        values, inverse, rest = self._fit(sigma)
+        count, dropped = len(sigma), int(np.isinf(sigma).sum())
+        chances = 2.0 * count * math.comb(count, dropped)
+        times = float(student.isf(CHANCE / chances, max(count - dropped - 2, 1)))
+        own = np.sqrt(inverse[:, 2, 2])
+        table = zip(self.radii.tolist(), values[:, 2].tolist(), own.tolist(), strict=True)
+        return [Step(radius, width, one, one * times) for radius, width, one in table], rest
+
+    def _widened(self, sigma: FloatArray, place: int) -> FloatArray:
+        """Widen the standard deviations of bins until a step at a radius leaves no more, (m,)."""
+        only = Profile(self.radii[[place]], self.basis[[place]], self.shift, sigma)
+        free = int(np.isfinite(sigma).sum()) - 2
+
+        def explained(more: float) -> bool:
+            return bool(np.square(only._fit(np.hypot(sigma, more))[2]).sum() <= free)
+
+        if explained(0.0):
+            return sigma
+        low, high = 0.0, float(np.abs(self.shift).max()) + 1.0
+        for _ in range(20):
+            middle = (low + high) / 2
+            low, high = (low, middle) if explained(middle) else (middle, high)
+        return np.hypot(sigma, high)
+
+
+def _basis(
+    radius: FloatArray, weight: FloatArray, place: npt.NDArray[np.intp], at: FloatArray, soft: float
+) -> FloatArray:
+    """Give shares of a common shift, a yaw and of steps at radii (r,) in each bin, (r, m, 3).
+
+    Args:
+        radius: of columns from the axis, (k,) [px].
+        weight: what they tell, (k,).
+        place: their bins, (k,).
+        at: the radii (r,) [px].
+        soft: sigma of the smoothing [px].
+    """
+    one_of = (place == np.arange(place.max() + 1)[:, None]) * weight
+    one_of /= one_of.sum(axis=1, keepdims=True)
+    bent = YAW_PX * (one_of @ np.square(radius / radius[-1]))
+    beyond = ndtr((radius - at[:, None]) / soft) @ one_of.T
+    return np.stack([np.ones_like(beyond), np.broadcast_to(bent, beyond.shape), beyond], axis=2)
+
+
+class ConjugateRays:
+    """Both ends of the rays of a full turn near the plane of the source.
+
+    Args:
+        scan: the scan on one circle.
+        band: means over groups of rows near the source's plane, (n, groups, cols), at even steps.
+        rows: middle row of each group, (groups,).
+        step: between views [rad].
+    """
+
+    def __init__(self, scan: CircularScan, band: FloatArray, rows: FloatArray, step: float) -> None:
+        self.scan, self.band, self.rows, self.step = scan, band, rows, step
+        self.views, self.cols = len(band), band.shape[2]
+        self.smoothing = max(1.0, self.cols / SMOOTHING, step * self.cols / VIEWS_OVER)
+        soft = gaussian_filter1d(band, self.smoothing, axis=2, mode="nearest")
+        self.splines = [
+            spline_filter(np.pad(one, ((EDGE, EDGE), (0, 0)), mode="wrap"))
+            for one in soft.transpose(1, 0, 2)
+        ]
+        self.sector = np.arange(self.views) * SECTORS // self.views
+
+    @classmethod
+    def of(cls, scan: CircularScan, turn: Turn) -> ConjugateRays:
+        """Take the rows near the source's plane from the frames of a turn."""
+        azimuth = scan.azimuth(turn.band_frames)
+        band, step = _evenly(np.asarray(turn.band, dtype=np.float64), azimuth)
+        return cls(scan, band, np.array(turn.band_rows), step)
+
+    def closed(self, column: int, width: float) -> ConjugateRays:
+        """Close a gap: what lies beyond its first column moves by its width."""
+        there = np.arange(self.cols, dtype=np.float64)
+        at = there - np.clip(there - (column - 0.5), 0.0, width)
+        low = np.minimum(np.floor(at).astype(np.intp), self.cols - 2)
+        part = at - low
+        band = (1.0 - part) * self.band[:, :, low] + part * self.band[:, :, low + 1]
+        return ConjugateRays(self.scan, band, self.rows, self.step)
+
+    @property
+    def row(self) -> float:
+        """Row that the column belongs to: the middle of those that are read."""
+        return float(self.rows.mean())
+
+    def column(self, values: FloatArray) -> tuple[FloatArray, float]:
+        """Move the first of the parameters of the plane until both ends of rays lie alike.
+
+        Args:
+            values: parameters in the order of `circular_scan.FREE`, (k,).
+
+        Returns:
+            The parameters, and the standard deviation of the column [px]; inf: too little turns.
+        """
+        values = values.copy()
+        slope = self.scan.slopes(values, self.scan.scales[: len(values)])[0]
+        for _ in range(ROUNDS):
+            _, moved, told, power = self._sums(values)
+            if not told.sum() > ALIKE * power.sum():
+                return values, math.inf
+            shift, sigma = _left_out(moved.sum(axis=1), told.sum(axis=1))
+            values[0] -= shift / 2.0 / slope
+        return values, sigma / 2.0
+
+    def profile(self, values: FloatArray) -> Profile | None:
+        """Read the distance between both ends of rays at each distance from the axis.
+
+        Args:
+            values: parameters in the order of `circular_scan.FREE`, (k,).
+
+        Returns:
+            The profile; None where too little turns.
+        """
+        radius, moved, told, power = self._sums(values)
+        if len(radius) == 0:
+            return None
+        weight = told.sum(axis=0)
+        place = (radius / max(WIDE * self.smoothing, radius[-1] / BINS)).astype(np.intp)
+        count = int(place[-1]) + 1
+        of_bin = (place[:, None] == np.arange(count)).astype(np.float64)
+        moved, told = moved @ of_bin, told @ of_bin
+        good = np.bincount(place, weight) > ALIKE * np.bincount(place, power)
+        if good.sum() < FEWEST_BINS:
+            return None
+        shift, sigma = np.ones((2, count))
+        for i in np.flatnonzero(good).tolist():
+            shift[i], sigma[i] = _left_out(moved[:, i], told[:, i])
+        kept, renumbered = good[place], np.cumsum(good) - 1
+        radius, weight, place = radius[kept], weight[kept].clip(1e-30), renumbered[place[kept]]
+        return Profile.of(radius, weight, place, shift[good], sigma[good], self.smoothing)
+
+    def _sums(self, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Give distances from the axis (k,); sums over each sector and distance of differences
+        times slopes and of slopes of one end times those of the other, (SECTORS, k) each; the
+        power of slopes (k,)."""
+        axis = self.scan.column(values, self.row)
+        radius = np.arange(0.5, min(self.cols - 1 - axis, axis) - 3.0 * self.smoothing)
+        apart, own, other = np.zeros((3, self.views, len(self.rows), len(radius)))
+        little = 0.25 + 0.25 * self.smoothing
+        columns = axis + radius
+        for i in range(len(self.rows)):
+            here, there = self._both(i, values, columns)
+            low, high = (self._both(i, values, columns + e) for e in (-little, little))
+            apart[:, i] = here - there
+            ends = zip(low, high, strict=True)
+            own[:, i], other[:, i] = ((b - a) / (2.0 * little) for a, b in ends)
+        for table in (apart, own, other):
+            table -= table.mean(axis=0)
+        moved, told = np.zeros((2, SECTORS, len(radius)))
+        np.add.at(moved, self.sector, (apart * (own + other)).sum(axis=1) / 2.0)
+        np.add.at(told, self.sector, (own * other).sum(axis=1))
+        power = (np.square(own) + np.square(other)).sum(axis=(0, 1)) / 2.0
+        return radius, moved, told, power
+
+    def _both(
+        self, group: int, values: FloatArray, columns: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Read rays to columns (k,) of a group of rows from both ends in all views, (n, k) each."""
+        view = self.scan.view(values)
+        middle = (np.array(self.scan.shape[::-1]) - 1) / 2
+        at = np.vstack([columns - middle[0], np.full(len(columns), self.rows[group] - middle[1]),
+                        np.ones(len(columns))])  # fmt: skip
+        mirrored = mirror_map(view) @ at
+        opposite = mirrored[0] / mirrored[2] + middle[0]
+        source, detector, u, v = view.reshape(4, 3)
+        ray = (detector - source)[:2, None] + u[:2, None] * at[0] + v[:2, None] * at[1]
+        inwards = -source[:2]
+        angle = np.arctan2(inwards[0] * ray[1] - inwards[1] * ray[0], inwards @ ray)
+        turned = (math.pi + 2.0 * angle) / self.step
+        first = np.arange(self.views)[:, None]
+        return self._read(group, 0.0 * turned + first, columns), self._read(
+            group, turned + first, opposite
+        )
+
+    def _read(self, group: int, view: FloatArray, columns: FloatArray) -> FloatArray:
+        """Read one group of rows between views (n, k) at columns of the panel (k,)."""
+        at = np.stack([view % self.views + EDGE, np.broadcast_to(columns, view.shape)])
+        return np.asarray(
+            map_coordinates(self.splines[group], at, order=3, prefilter=False, mode="nearest")
+        )
+
+
+def _left_out(moved: FloatArray, told: FloatArray) -> tuple[float, float]:
+    """Give a ratio of sums over sectors (SECTORS,), and its sigma from leaving out each."""
+    count = len(told)
+    without = (moved.sum() - moved) / (told.sum() - told)
+    scatter = np.square(without - without.mean()).sum() * (count - 1) / count
+    return float(moved.sum() / told.sum()), float(np.sqrt(scatter)) + 1e-6
+
+
+def _evenly(band: FloatArray, azimuth: FloatArray) -> tuple[FloatArray, float]:
+    """Sort views by their azimuth [rad], and put them at even steps over a turn; give the step."""
+    around = azimuth % (2 * math.pi)
+    order = np.argsort(around, kind="stable")
+    around, band = around[order], band[order]
+    gaps = np.diff(around, append=around[0] + 2 * math.pi)
+    usual = float(np.median(gaps[gaps > 1e-6]))
+    if np.abs(gaps / usual - 1.0).max() < 0.02:
+        return band, 2 * math.pi / len(band)
+    views = round(2 * math.pi / usual)
+    at = around[0] + np.arange(views) * 2 * math.pi / views
+    after = np.searchsorted(around, at + 1e-9) % len(around)
+    before = after - 1
+    wide = np.maximum((around[after] - around[before]) % (2 * math.pi), 1e-12)
+    part = (((at - around[before]) % (2 * math.pi)) / wide).clip(0.0, 1.0)[:, None, None]
+    return (1.0 - part) * band[before] + part * band[after], 2 * math.pi / views

@@ -1,0 +1,132 @@
+"""Whether the panel has a gap: what frames show beside a border, certified by both ends of rays.
+
+A wall that turns back at a column looks like a gap to single frames (`tile_gap.py`); to both ends
+of the same rays (`conjugate_rays.py`) it does not. A gap is told where a step between their
+distances stands out from what the scan does at all other distances from the axis, or where the
+frames see a gap and the step there has its sign. Beside the axis, where no distance is inside
+of a step, what frames see counts by itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from flexdt.twin.calibration.without_phantom.conjugate_rays import ConjugateRays, Profile, Step
+from flexdt.twin.calibration.without_phantom.tile_gap import Gap, local_gaps
+from flexdt.twin.errors import NotIdentifiableError
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+
+SIGMAS: Final = 3.0
+"""A width of fewer sigmas is no gap."""
+ROUNDS: Final = 3
+"""Times a gap is closed to see what is left of it."""
+
+
+def find_gap(
+    rays: ConjugateRays,
+    values: FloatArray,
+    frames: Sequence[Float32Array],
+    closed: Sequence[float] = (),
+) -> Gap | None:
+    """Find the gap between two tiles, if there is one.
+
+    Args:
+        rays: both ends of rays of a turn.
+        values: parameters of the plane of symmetry in the order of `circular_scan.FREE`, (k,).
+        frames: line integrals of `tile_gap.averaged_rows`, some of the turn.
+        closed: columns of borders beside which the images are filled in.
+
+    Raises:
+        NotIdentifiableError: there are two.
+    """
+    values, sigma = rays.column(values)
+    profile = rays.profile(values) if np.isfinite(sigma) else None
+    if profile is None:
+        return None
+    axis = rays.scan.column(values, rays.row)
+    seen = local_gaps(frames, axis, closed)
+    certified = [gap for gap in seen if _certified(gap, profile, axis, rays.smoothing)]
+    step = profile.best()
+    if not certified and not step.significant:
+        return None
+    first = certified[0] if certified else _from_step(step, axis)
+    gap = _refined(rays, values, first)
+    if not certified and gap.width < SIGMAS * gap.sigma:
+        return None
+    others = [
+        one
+        for one in seen
+        if abs(one.column - first.column) > 2.0 * rays.smoothing
+        and not _refuted(one, profile, axis)
+    ]
+    _require_one(rays, values, gap, others)
+    return gap
+
+
+def _certified(gap: Gap, profile: Profile, axis: float, smoothing: float) -> bool:
+    """Say whether both ends of rays agree with a gap that single frames show."""
+    beside = gap.column - 0.5 - axis
+    step = profile.at(abs(beside))
+    if abs(step.width) > SIGMAS * step.sigma:
+        return bool(np.sign(step.width) == np.sign(beside))
+    return bool(abs(beside) < 2.0 * smoothing and SIGMAS * step.sigma > gap.width)
+
+
+def _refuted(gap: Gap, profile: Profile, axis: float) -> bool:
+    """Say whether both ends of rays leave less than half of a gap that single frames show."""
+    beside = gap.column - 0.5 - axis
+    step = profile.at(abs(beside))
+    return step.width * float(np.sign(beside)) + SIGMAS * step.sigma < gap.width / 2
+
+
+def _from_step(step: Step, axis: float) -> Gap:
+    """Give the gap on that side of the axis which the sign of a step says."""
+    side = float(np.sign(step.width))
+    return Gap(round(axis + side * step.radius + 0.5), abs(step.width), step.sigma)
+
+
+def _closed(
+    rays: ConjugateRays, values: FloatArray, column: int, width: float
+) -> tuple[ConjugateRays, FloatArray]:
+    """Close a gap, and find the axis anew."""
+    closed = rays.closed(column, width)
+    return closed, closed.column(values)[0]
+
+
+def _refined(rays: ConjugateRays, values: FloatArray, gap: Gap) -> Gap:
+    """Correct the width of a gap by the step that is left when it is closed."""
+    for _ in range(ROUNDS):
+        closed, again = _closed(rays, values, gap.column, gap.width)
+        beside = gap.column - 0.5 - rays.scan.column(again, rays.row)
+        profile = closed.profile(again)
+        left = profile.at(abs(beside)) if profile else None
+        if left is None or left.sigma > gap.sigma:
+            return gap
+        width = max(gap.width + float(np.sign(beside)) * left.width, 0.0)
+        gap = gap._replace(width=width, sigma=left.sigma)
+    return gap
+
+
+def _require_one(rays: ConjugateRays, values: FloatArray, gap: Gap, others: Sequence[Gap]) -> None:
+    """Check that no other gap is left when one is closed.
+
+    Raises:
+        NotIdentifiableError: there is another.
+    """
+    closed, again = _closed(rays, values, gap.column, gap.width)
+    profile = closed.profile(again)
+    step = profile.best() if profile else None
+    columns = [one.column for one in others]
+    if step is not None and step.significant:
+        axis = rays.scan.column(again, rays.row)
+        columns.append(_from_step(step, axis).column)
+    if columns:
+        both = sorted((gap.column, columns[0]))
+        raise NotIdentifiableError(
+            f"from columns {both[0]} and {both[1]} on everything appears nearer, as behind two "
+            "gaps between tiles of the panel, of which one can be found; calibrate with a phantom, "
+            "and give that correction"
+        )
