@@ -101,7 +101,7 @@ def stated_priors(scans: Sequence[Scan], request: CalibrationRequest) -> dict[st
 
 def strain_prior(model: BeadModel, request: CalibrationRequest) -> Strain:
     """Give the standard deviations of the phantom's stretches and shears [1]."""
-    return known_strain(model, request.bead_tolerance_mm, request.priors, request.free)
+    return known_strain(model, request.free, request.priors, request.bead_tolerance_mm)
 
 
 def with_free(request: CalibrationRequest, names: Sequence[str]) -> CalibrationRequest:

@@ -29,7 +29,7 @@ from flexdt.library.scan_limits import (
 from flexdt.phantoms import Phantom, bead_phantom, load_phantom, material, stated_keV
 from flexdt.phantoms.channels import chain_through, channels, line_integrals
 from flexdt.twin.calibration import FitResult, bead_model, estimate_geometry
-from flexdt.twin.calibration.fit.priors import known
+from flexdt.twin.calibration.fit.priors import known, known_strain
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
@@ -401,6 +401,7 @@ def _calibrations(plan: Plan, item: Item) -> tuple[dict[str, Array], dict[str, A
         fit = estimate_geometry(
             noisy, model, item.poses, free, shape=item.shape, noise_px=item.noise_px,
             priors=known(free, plan.calibrate.priors),
+            strain=known_strain(model, free, plan.calibrate.priors),
         )  # fmt: skip
         return {}, _judged(fit, item, free, fit.identifiable, "")
     from flexdt.twin.calibration.pipeline import CalibrationRequest, Scan, calibrate

@@ -36,9 +36,10 @@ def beads_of(kind: str) -> npt.NDArray[np.float64]:
 
 
 def assert_as_forecast(fit: FitResult, model: BeadModel, priors: Given | None) -> None:
-    at = Offsets.from_edge(TRUTH)
-    noise = fit.certificate.rms_px
-    forecast = identifiability(model, POSES, noise, shape=own.SHAPE, priors=priors, at=at)
+    forecast = identifiability(
+        model, POSES, fit.certificate.rms_px, shape=own.SHAPE, priors=priors,
+        at=Offsets.from_edge(TRUTH),
+    )  # fmt: skip
     for name in SIX:
         assert forecast.sigmas[name] == pytest.approx(fit.sigmas[name], rel=AGREE), name
     (seen,) = image_quantities(fit)

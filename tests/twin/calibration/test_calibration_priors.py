@@ -54,10 +54,10 @@ def test_a_detector_aside_is_no_confident_error() -> None:
 
 
 def test_the_measurement_that_is_named_tells_more() -> None:
-    given = {"shape": SHAPE, "priors": PRIORS, "bead_tolerance_mm": 0.0}
-    one = identifiability(BEADS, poses(), NOISE_PX, **given)
+    exact = {"shape": SHAPE, "priors": PRIORS, "bead_tolerance_mm": 0.0}
+    one = identifiability(BEADS, poses(), NOISE_PX, **exact)
     both = Poses.concatenate([poses(), poses(0.75 * SOD)])
-    two = identifiability(BEADS, both, NOISE_PX, **given)
+    two = identifiability(BEADS, both, NOISE_PX, **exact)
     for name in ("dO_x", "dO_y", "dO_z", "alpha"):
         assert two.sigmas[name] < 0.2 * one.sigmas[name]
     assert "SOD" in one.suggestions[0].change

@@ -109,9 +109,8 @@ def identifiability(
         shape: detector (rows, cols); None is the default machine's camera. Beads that would not
             lie wholly on it do not count.
         at: the geometry to predict at.
-        bead_tolerance_mm: > 0: bead positions are unknowns with this prior. 0: they are exactly
-            where the phantom says. None: the phantom as a whole is strained a little, as `flexdt
-            calibrate` assumes.
+        bead_tolerance_mm: > 0: bead positions are unknowns with this prior; 0: they are exact;
+            None: the phantom as a whole may be strained, as `flexdt calibrate` assumes.
         priors: what is known of other offsets [mm, deg, 1], in place of what `flexdt calibrate`
             assumes of a scanner that states nothing; 0 is exactly, "none" is all exactly.
         bound: sigma [mm, deg] beyond which a direction counts as not determined.
@@ -135,7 +134,8 @@ def identifiability(
     >>> identifiability(bead_phantom("normal", 1), poses, shape=(760, 956)).identifiable
     False
     """
-    tolerance = require_tolerance(bead_tolerance_mm or 0.0)
+    tolerance = bead_tolerance_mm or 0.0
+    require_tolerance(tolerance)
     model = bead_model(phantom)
     poses = as_poses(geometry)
 
@@ -151,7 +151,7 @@ def identifiability(
         problem = build_problem(
             tracks, beads, plan, free=free, shape=sizes, noise_px=noise_px,
             free_beads=tolerance > 0, start=at, bead_tolerance_mm=tolerance, priors=widths,
-            strain=known_strain(beads, bead_tolerance_mm, priors, free),
+            strain=known_strain(beads, free, priors, bead_tolerance_mm),
         )  # fmt: skip
         return forecast(problem, bound), visible
 
@@ -209,10 +209,11 @@ def forecast(problem: FitProblem, bound: float = BOUND) -> Forecast:
     seen = int(problem.seen.any(axis=0).sum())
     rows = np.concatenate([problem.jacobian(problem.start), np.diag(1.0 / problem.prior_sigma)])
     spec = spectrum(rows, names, seen, reported=count, bound=bound)
-    strained = range(problem.layout.bead_columns.stop, problem.layout.panel_column)
-    if count < reported or strained:
+    strained = problem.layout.strain_columns
+    if count < reported or strained.start < strained.stop:
         # Rank and condition say what the images tell of what was asked for, all else given.
-        given = [i for i in range(len(names)) if not count <= i < reported and i not in strained]
+        nuisance = {*range(count, reported), *range(strained.start, strained.stop)}
+        given = [i for i in range(len(names)) if i not in nuisance]
         alone = spectrum(rows[:, given], [names[i] for i in given], seen, reported=count)
         rank = min(alone.rank, len(given) - len(spec.null))
         unit = spec.unit_covariance

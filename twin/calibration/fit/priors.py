@@ -73,19 +73,29 @@ def known(
 
 def known_strain(
     model: BeadModel,
-    bead_tolerance_mm: float | None = None,
-    given: Given | None = None,
     free: Container[str] = SIX,
+    given: Given | None = None,
+    bead_tolerance_mm: float | None = None,
 ) -> Strain:
-    """Give what is known of the phantom's shape: standard deviations of stretches and shears [1].
+    """Give what is known of the phantom's shape as a whole: standard deviations [1].
 
-    They are 0 where the beads are exactly where the phantom says (a tolerance of 0, or every
-    offset of the scanner stated as exact) or are unknowns themselves (a tolerance above 0), and
-    less than STRAIN where the phantom's own tolerance is.
+    It is 0 where beads are exactly where the phantom says (`bead_tolerance_mm` 0, or every offset
+    of the scanner stated as exact), or are unknowns themselves; less than STRAIN where the
+    phantom's own tolerance is.
+
+    Args:
+        model: the phantom's beads.
+        free: parameters that are estimated.
+        given: what a user states of the scanner; None: nothing.
+        bead_tolerance_mm: what a user states of the beads; None: nothing.
+
+    Returns:
+        Of stretches, and of shears.
     """
-    if bead_tolerance_mm is not None or given == "none":
+    stated = exact(free) if given == "none" else given or {}
+    if bead_tolerance_mm is not None:
         return UNSTRAINED
-    if given and all(given.get(name) == 0.0 for name in ASSUMED if name not in free):
+    if all(stated.get(name) == 0.0 for name in ASSUMED if name not in free):
         return UNSTRAINED
     reach = float(np.sqrt(np.mean(np.sum(model.beads**2, axis=1))))
     if not model.tolerance_mm > 0 or not reach > 0:
