@@ -27,10 +27,11 @@ from flexdt.twin.calibration import (
     visible_beads,
 )
 from flexdt.twin.calibration.detect.detection import Detections
+from flexdt.twin.calibration.fit.fit import IN_IMAGES, axis_in_image
 from flexdt.twin.calibration.identify import Search, identify, overlapping
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+from flexdt.twin.geometry.offsets import Offsets
 from flexdt_extensions.phantom_design.information_table import (
     CRITERIA,
     Criterion,
@@ -77,33 +78,44 @@ def share_identified(
 def measured_spread(
     model: BeadModel, planned: PlannedScans, *, trials: int = 60, seed: int = 1
 ) -> dict[str, float]:
-    """Standard deviation of real fits to noisy simulated points, edge units.
+    """Root mean square error of real fits to noisy simulated points: parameters and IN_IMAGES.
 
     The check of `design.forecast`.
 
     Args:
-        model: the beads; with a tolerance in `planned` each trial's beads are off by it.
+        model: the beads; with a tolerance in `planned` each trial's beads are off by it, and what
+            has a prior by that.
         planned: the scans.
         trials: fits.
         seed: of the noise.
+
+    Returns:
+        Name -> standard deviation, edge units.
     """
     rng = np.random.default_rng([seed, 11])
-    values: list[list[float]] = []
+    errors: list[dict[str, float]] = []
     tolerance = planned.bead_tolerance_mm
     free_beads = tolerance > 0
+    widths = {name: width for name, width in planned.widths.items() if width > 0}
     for _ in range(trials):
+        hidden = {name: width * rng.normal() for name, width in widths.items()}
+        truth = Offsets.from_edge(hidden)
         beads = model.beads + rng.normal(0.0, tolerance, model.beads.shape) * free_beads
-        tracks = _tracks(BeadModel(beads, model.bead_radius_mm), planned, NOMINAL)
+        tracks = _tracks(BeadModel(beads, model.bead_radius_mm), planned, truth)
         tracks = tracks + rng.normal(0.0, planned.noise_px, tracks.shape)
         fit = estimate_geometry(
             tracks, model, planned.poses, planned.free, shape=planned.sizes(),
             noise_px=planned.noise_px, free_beads=free_beads,
-            bead_tolerance_mm=tolerance if free_beads else None,
+            bead_tolerance_mm=tolerance if free_beads else None, priors=widths,
         )  # fmt: skip
-        names = [name for name in planned.free if name in fit.values]
-        values.append([fit.values[name] for name in names])
-    spread = np.std(np.array(values), axis=0, ddof=1)
-    return dict(zip(names, spread.tolist(), strict=True))
+        off = {n: fit.values[n] - hidden.get(n, 0.0) for n in planned.free if n in fit.values}
+        seen, true = (
+            axis_in_image(planned.poses[:1], at, fit.problem.origin[0])
+            for at in (fit.parameters, truth)
+        )
+        errors.append(off | dict(zip(IN_IMAGES, (seen - true).tolist(), strict=True)))
+    square = {name: np.mean([off[name] ** 2 for off in errors]) for name in errors[0]}
+    return {name: math.sqrt(float(value)) for name, value in square.items()}
 
 
 def _tracks(model: BeadModel, planned: PlannedScans, at: Offsets) -> FloatArray:
@@ -151,11 +163,13 @@ class BeadForecast:
 
     Attributes:
         sigmas: parameter -> predicted standard deviation, edge units; inf if not determined.
+        image_sigmas: the same of IN_IMAGES: column [px] and angle [deg] of the axis, magnification.
         score: value of the criterion, smaller is better.
         used: share of all spots that count (in view, touching no other).
     """
 
     sigmas: dict[str, float]
+    image_sigmas: dict[str, float]
     score: float
     used: float
 
@@ -192,13 +206,14 @@ def forecast(model: BeadModel, planned: PlannedScans, criterion: Criterion = "a"
     """
     seats = SeatTable.of(model.beads, float(model.bead_radius_mm.max()), planned, 1.0)
     masks = seats.alone(np.arange(len(model)))
-    information = seats.information(masks)[None]
-    names = seats.names
-    covariance = inverse(information)[0]
+    information = seats.information(masks)
+    covariance = inverse(information + np.diag(seats.known))
     sigma = np.sqrt(np.diag(covariance)) * seats.tolerances
+    felt = seats.felt(information)
     return BeadForecast(
-        dict(zip(names, sigma.tolist(), strict=True)),
-        float(score_of(information, criterion)[0]),
+        dict(zip(seats.names[: seats.asked], sigma.tolist(), strict=False)),
+        dict(zip(IN_IMAGES, (np.sqrt(np.diag(felt)) / seats.edge_px).tolist(), strict=True)),
+        float(score_of(felt[None], criterion)[0]),
         float(masks.mean()),
     )
 
@@ -355,7 +370,7 @@ def _exchanged(
     """Exchange beads one at a time for the best seat until no exchange helps."""
     masks = table.alone(chosen)
     summed = np.einsum("kn,knf->kf", masks.astype(np.float64), table.blocks[chosen])
-    best = float(score_of(table.marginal(summed).sum(axis=0)[None], criterion)[0])
+    best = float(score_of(table.felt(table.marginal(summed).sum(axis=0))[None], criterion)[0])
     improved = True
     if turned_likeness(table.places[chosen]) < rules.unlike:
         best = math.inf
@@ -387,7 +402,7 @@ def _scores_beside(
     kept = (table.alone(others)[None] & ~touch).astype(np.float64)
     theirs = np.matmul(kept.transpose(1, 0, 2), table.blocks[others])  # (k-1, m, f)
     information = table.marginal(mine) + table.marginal(theirs).sum(axis=0)
-    return score_of(information, criterion)
+    return score_of(table.felt(information), criterion)
 
 
 def _polished(

@@ -50,13 +50,14 @@ def design(
     from flexdt.library.machines import machine as find_machine
     from flexdt.library.machines import profile as find_profile
     from flexdt.twin.calibration import SIX
+    from flexdt.twin.calibration.fit.priors import known, prior_widths
     from flexdt_extensions.phantom_design import phantom_design as work
     from flexdt_extensions.phantom_design.information_table import PlannedScans
     from flexdt_extensions.phantom_design.seats import stack_of
 
     scanner = find_machine(machine)
+    offsets = find_profile(profile, scanner, machine)
     if plan is not None:
-        offsets = find_profile(profile, scanner, machine)
         poses, shape = work.script_poses(
             plan.read_bytes().decode("utf-8", "surrogateescape"), scanner, offsets
         )
@@ -65,7 +66,9 @@ def design(
         poses, shape = work.circle_poses(scanner, places, sdd, frames)
     if not (noise > 0 and tolerance >= 0 and radius > 0):
         raise typer.BadParameter("--noise and --radius must be positive, --bead-tolerance >= 0")
-    scans = PlannedScans(poses, shape, noise, names(free) if free else SIX, tolerance)
+    asked = names(free) if free else SIX
+    priors = known(asked, scanners=[prior_widths(scanner, offsets)])
+    scans = PlannedScans(poses, shape, noise, asked, tolerance, priors)
     request = work.DesignRequest(
         beads, radius, bead, per_brick, criterion, seed=seed, trials=trials
     )

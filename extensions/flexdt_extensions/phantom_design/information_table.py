@@ -2,12 +2,18 @@
 of a set of positions.
 
 Each bead adds a block of its own to the Fisher information of the planned frames, so a set of
-positions is judged by adding blocks. A spot that touches another one in a frame counts for nothing
-there, as in identification. `bead_search` does the choosing.
+positions is judged by adding blocks, and what is known beforehand of the parameters. A spot that
+touches another one in a frame counts for nothing there, as in identification. `bead_search` does
+the choosing.
+
+A set is scored by what a reconstruction feels: how far column and angle of the axis and
+magnification displace the image at the panel's edge. Of the stage's offsets, most is what is not
+known of the panel, which no bead tells.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Final, Literal
@@ -24,15 +30,21 @@ from flexdt.twin.calibration import (
     tolerance_of,
     visible_beads,
 )
+from flexdt.twin.calibration.fit.fit import image_slopes
+from flexdt.twin.calibration.fit.priors import NOISE_PX, known
+from flexdt.twin.calibration.fit.problem import FitProblem
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.poses import Poses
 
 Criterion = Literal["a", "d", "worst"]
 CRITERIA: Final[Mapping[Criterion, str]] = {
-    "a": "A-optimality: root mean square of sigma / tolerance",
-    "d": "D-optimality: geometric mean of the ellipsoid's axes, in tolerances",
-    "worst": "the largest sigma / tolerance",
+    "a": "A-optimality: root mean square displacement at the panel's edge [px] by column and angle "
+    "of the axis and magnification",
+    "d": "D-optimality: geometric mean of the axes of their ellipsoid [px at the panel's edge]",
+    "worst": "the largest displacement at the panel's edge [px] by one of them",
 }
+AT_ONCE: Final = 8
+"""Seats whose share is computed together."""
 RIDGE: Final = 1e-9
 """Information added so that sets which determine too little can still be compared."""
 
@@ -47,13 +59,21 @@ class PlannedScans:
         noise_px: standard deviation of a detected coordinate.
         free: parameters to be estimated, shared by all placements.
         bead_tolerance_mm: > 0: how well beads sit where they should; they are estimated, too.
+        priors: what is known of the other parameters [mm, deg, 1], 0 exactly; None: as `known` of
+            `fit.priors` has it.
     """
 
     poses: Poses
     shape: tuple[int, int]
-    noise_px: float = 0.1
+    noise_px: float = NOISE_PX
     free: tuple[str, ...] = SIX
     bead_tolerance_mm: float = 0.0
+    priors: Mapping[str, float] | None = None
+
+    @property
+    def widths(self) -> Mapping[str, float]:
+        """The priors, those that are assumed where none are given."""
+        return known(self.free) if self.priors is None else self.priors
 
     def sizes(self) -> FloatArray:
         """(n, 2) detector (rows, cols) of each frame."""
@@ -74,12 +94,18 @@ class SeatTable:
 
     `blocks` (m, n, q q) is a seat's information in one frame, parameters in units of their
     tolerance, the bead's own coordinates after them; `pixels` (m, n, 2) and `reach` (m, n) say
-    where its spot is and how far it must stay from others'; `visible` (m, n).
+    where its spot is and how far it must stay from others'; `visible` (m, n). `known` (p,) is the
+    information of the parameters' priors, and `slopes` (3, p) how they change IN_IMAGES, both in
+    tolerances; `edge_px` (3,) is the displacement at the panel's edge by a unit of these.
     """
 
     places: FloatArray
     names: tuple[str, ...]
+    asked: int
     tolerances: FloatArray
+    known: FloatArray
+    slopes: FloatArray
+    edge_px: FloatArray
     blocks: FloatArray
     pixels: FloatArray
     radii: FloatArray
@@ -91,27 +117,33 @@ class SeatTable:
         cls, places: FloatArray, radius: float, planned: PlannedScans, weight: float
     ) -> SeatTable:
         """The table of places for beads of a radius [mm]; each frame counts `weight` times."""
-        parts: list[FloatArray] = []
-        names: tuple[str, ...] = ()
-        prior = planned.bead_tolerance_mm
-        for first in range(0, len(places), 8):
-            rows, names = _rows(BeadModel(places[first : first + 8], np.array(radius)), planned)
-            parts.append(rows)
-        rows = np.concatenate(parts)  # (m, n, 2, q)
-        p = len(names)
+        problems = [
+            _problem(BeadModel(places[first : first + AT_ONCE], np.array(radius)), planned)
+            for first in range(0, len(places), AT_ONCE)
+        ]
+        rows = np.concatenate([_rows(problem) for problem in problems])  # (m, n, 2, q)
+        layout = problems[0].layout
+        p = layout.parameter_count
+        names = layout.names[:p]
         tolerances = np.array([tolerance_of(name) for name in names])
         rows[..., :p] *= tolerances
         blocks = weight * np.einsum("mnip,mniq->mnpq", rows, rows)
         model = BeadModel(places, np.array(radius))
+        seen, slopes = image_slopes(problems[0], problems[0].start, 0)
+        widths = problems[0].prior_sigma[:p] * np.array([edge_factor(name) for name in names])
         return cls(
             places,
             names,
+            layout.asked,
             tolerances,
+            (tolerances / widths) ** 2,
+            slopes * tolerances,
+            _edge_px(seen, planned.shape),
             blocks.reshape(*blocks.shape[:2], -1),
             planned.poses.cone_vec().project_points(places, (1, 1)).transpose(1, 0, 2),
             spot_radii(model, planned.poses.cone_vec()).T,
             visible_beads(model, planned.poses, planned.sizes()).T,
-            prior,
+            planned.bead_tolerance_mm,
         )
 
     def touching(self, a: npt.NDArray[np.int64], b: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
@@ -146,23 +178,40 @@ class SeatTable:
             full[..., :p, :p] - cross @ np.linalg.solve(own, np.swapaxes(cross, -1, -2))
         )
 
+    def felt(self, information: FloatArray) -> FloatArray:
+        """(..., 3, 3) covariance of IN_IMAGES [px at the panel's edge] for information (..., p, p)
+        of the images; where it is not determined, by a little information that is added."""
+        whole = information + np.diag(self.known + RIDGE)
+        rows = self.slopes * self.edge_px[:, None]
+        return np.asarray(rows @ np.linalg.solve(whole, rows.T))
 
-def _rows(model: BeadModel, planned: PlannedScans) -> tuple[FloatArray, tuple[str, ...]]:
-    """Whitened Jacobian rows of each bead, (k, n, 2, q) edge units, and the parameters' names."""
+
+def _edge_px(seen: FloatArray, shape: tuple[int, int]) -> FloatArray:
+    """Displacement at the panel's edge [px] by a unit of each of IN_IMAGES: px, deg, 1."""
+    rows, cols = shape
+    return np.array([1.0, math.radians(1.0) * rows / 2.0, cols / 2.0 / seen[2]])
+
+
+def _problem(model: BeadModel, planned: PlannedScans) -> FitProblem:
+    """The planned scans of some beads, every spot of them seen."""
     n, k = len(planned.poses), len(model)
-    problem = build_problem(
+    return build_problem(
         np.zeros((n, k, 2)), model, planned.poses, free=planned.free, shape=planned.sizes(),
-        noise_px=planned.noise_px, free_beads=planned.bead_tolerance_mm > 0,
+        noise_px=planned.noise_px, free_beads=planned.bead_tolerance_mm > 0, priors=planned.widths,
     )  # fmt: skip
-    names = problem.layout.names
-    factor = np.array([edge_factor(name) for name in names])
+
+
+def _rows(problem: FitProblem) -> FloatArray:
+    """Whitened Jacobian rows of each bead, (k, n, 2, q) edge units."""
+    n, k = problem.seen.shape
+    factor = np.array([edge_factor(name) for name in problem.layout.names])
     rows = (problem.jacobian(problem.start) / factor).reshape(n, k, 2, -1).transpose(1, 0, 2, 3)
     p = problem.layout.parameter_count
-    if p == len(names):
-        return np.array(rows), names
+    if problem.layout.bead_column < 0:
+        return np.array(rows[..., :p])
     # A bead's rows touch its own three coordinates only.
     own = np.stack([rows[i, :, :, p + 3 * i : p + 3 * i + 3] for i in range(k)])
-    return np.concatenate([rows[..., :p], own], axis=3), names[:p]
+    return np.concatenate([rows[..., :p], own], axis=3)
 
 
 def inverse(information: FloatArray) -> FloatArray:
@@ -177,16 +226,14 @@ def inverse(information: FloatArray) -> FloatArray:
     return np.asarray(covariance)
 
 
-def score_of(information: FloatArray, criterion: Criterion) -> FloatArray:
-    """The criterion of a stack of information matrices (m, p, p), ridge included."""
-    p = information.shape[-1]
-    values, vectors = np.linalg.eigh(information + RIDGE * np.eye(p))
-    values = np.maximum(values, RIDGE / 2)
+def score_of(covariance: FloatArray, criterion: Criterion) -> FloatArray:
+    """The criterion of a stack of covariances (m, q, q)."""
+    variances = np.diagonal(covariance, axis1=-2, axis2=-1)
     match criterion:
         case "a":
-            return np.asarray(np.sqrt(np.mean(1.0 / values, axis=-1)))
+            return np.asarray(np.sqrt(variances.mean(axis=-1)))
         case "d":
-            return np.asarray(np.exp(-0.5 * np.mean(np.log(values), axis=-1)))
+            values = np.linalg.eigvalsh(covariance)
+            return np.asarray(np.exp(0.5 * np.log(np.maximum(values, RIDGE**2)).mean(axis=-1)))
         case _:
-            variances = np.einsum("mij,mj->mi", vectors**2, 1.0 / values)
             return np.asarray(np.sqrt(variances.max(axis=-1)))

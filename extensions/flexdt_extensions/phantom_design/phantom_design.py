@@ -26,6 +26,7 @@ from flexdt.library.report_page import bullets, heading, page, paragraph, table
 from flexdt.phantoms import Phantom, cuboid_with_beads, spiral_positions
 from flexdt.phantoms.bricks import Brickwork, lego_phantom
 from flexdt.twin.calibration import BeadModel
+from flexdt.twin.calibration.fit.fit import IN_IMAGES
 from flexdt.twin.calibration.fit.weak_directions import BOUND, TOLERANCE, unit_of
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.camera import CameraSettings
@@ -167,6 +168,7 @@ def run_design(
                 "beads": model.beads.tolist(),
                 "score": guess.score,
                 "sigmas": guess.sigmas,
+                "image_sigmas": guess.image_sigmas,
                 "measured": measured_spread(model, scans, trials=request.trials, seed=request.seed)
                 if request.trials >= 2 and math.isfinite(guess.worst)
                 else None,
@@ -182,6 +184,7 @@ def run_design(
         "noise_px": scans.noise_px,
         "bead_tolerance_mm": scans.bead_tolerance_mm,
         "free": list(scans.free),
+        "priors": dict(scans.widths),
         "trials": request.trials,
         "seed": request.seed,
         "discarded": found.discarded,
@@ -204,19 +207,21 @@ def verdict(document: dict[str, Any]) -> str:
 
 
 def table_rows(document: dict[str, Any]) -> list[tuple[str, ...]]:
-    """Parameter, unit, then predicted and measured of both, and the ratio of the predictions."""
+    """What a reconstruction feels and is optimised, then the parameters that it follows from: name,
+    unit, then predicted and measured of both, and the ratio of the predictions."""
     ours, theirs = document["design"], document["spiral"]
     return [
         (
-            name,
-            unit_of(name),
+            f"{name} (optimised)" if kind == "image_sigmas" else name,
+            IN_IMAGES[name] if kind == "image_sigmas" else unit_of(name),
             f"{sigma:.3g}",
             _of(ours["measured"], name),
-            f"{theirs['sigmas'][name]:.3g}",
+            f"{theirs[kind][name]:.3g}",
             _of(theirs["measured"], name),
-            "-" if document["gain"] is None else f"{theirs['sigmas'][name] / sigma:.2f}",
+            "-" if document["gain"] is None else f"{theirs[kind][name] / sigma:.2f}",
         )
-        for name, sigma in ours["sigmas"].items()
+        for kind in ("image_sigmas", "sigmas")
+        for name, sigma in ours[kind].items()
     ]
 
 

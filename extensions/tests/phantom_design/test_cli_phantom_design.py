@@ -25,7 +25,10 @@ def test_lego_design_is_written_whole(tmp_path: Path, capsys: pytest.CaptureFixt
     assert document["gain"] > 1.0
     assert ours["identified"] == 1.0
     assert set(ours["sigmas"]) == set(document["spiral"]["sigmas"]) == set(document["free"])
-    assert set(ours["measured"]) == set(document["free"])
+    felt = {"axis_column", "axis_angle", "magnification"}
+    assert set(ours["image_sigmas"]) == felt
+    assert set(ours["measured"]) == set(document["free"]) | felt
+    assert document["priors"]["dD_x"] > 0
     found = as_phantom(str(out / "phantom.json"))
     np.testing.assert_allclose(found.beads, ours["beads"])
     np.testing.assert_allclose(
@@ -89,7 +92,7 @@ def test_bad_wishes(
 def test_a_spiral_that_does_not_determine_anything_is_not_a_factor() -> None:
     from flexdt_extensions.phantom_design.phantom_design import table_rows, verdict
 
-    entry = {"sigmas": {"dO_x": 0.1}, "measured": None}
+    entry = {"sigmas": {"dO_x": 0.1}, "image_sigmas": {"axis_column": 0.01}, "measured": None}
     document: dict[str, object] = {
         "design": entry,
         "spiral": {**entry, "sigmas": {"dO_x": 5e5}, "name": "spiral-50"},
@@ -97,5 +100,6 @@ def test_a_spiral_that_does_not_determine_anything_is_not_a_factor() -> None:
         "criterion_text": "A",
     }
     assert verdict(document).startswith("spiral-50 does not determine the geometry")
+    assert [row[0] for row in table_rows(document)] == ["axis_column (optimised)", "dO_x"]
     assert table_rows(document)[0][-1] == "-"
     assert "2.00 times better than spiral-50" in verdict(document | {"gain": 2.0})
