@@ -10,6 +10,7 @@ import io
 import json
 import os
 import struct
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
@@ -18,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.phantoms.checked_reading import PhantomError
+from flexdt.phantoms.files.shells import filled_twice
 from flexdt.phantoms.materials import material as material_of
 from flexdt.phantoms.phantom import Phantom
 from flexdt.phantoms.pieces import Surface, Voxels
@@ -54,6 +56,9 @@ ITEM_COLUMNS: Final = {
 }  # fmt: skip
 """Sizes of glTF's component types and element types (glTF 2.0 specification, 3.6.2)."""
 TRIANGLE_FAN: Final = 6
+STL_HEAD: Final = 84
+STL_TRIANGLE: Final = 50
+"""Bytes of a binary STL before its triangles, and of each."""
 MAX_PLANES: Final = 128
 """A convex mesh with at most so many planes is projected as a solid, others as their triangles."""
 
@@ -149,6 +154,13 @@ def filled_mesh(
     x, y, z = (2.0 * np.maximum(np.abs(low), np.abs(high))).tolist()
     solid = _convex(mesh, vertices)
     what = f"{len(mesh.faces)} triangles of {label} in {unit}, filled with {material}"
+    if twice := filled_twice(vertices, mesh.faces):
+        inner = "1 shell lies" if twice == 1 else f"{twice} shells lie"
+        warnings.warn(
+            f"{label}: {inner} in what others fill, turned outwards, and changes nothing; turn "
+            "cavities inwards",
+            stacklevel=2,
+        )
     return Phantom(
         name,
         what,
@@ -364,7 +376,19 @@ def _check_gltf(document: Any, total: int) -> None:
         raise ValueError(f"it has more than {MAX_FACES} triangles")
 
 
-_CHECKS: Final = {"glb": _check_glb, "ply": _check_ply}
+def _check_stl(raw: bytes) -> None:
+    """Compare the length of a binary file with the one that its head announces."""
+    if len(raw) < STL_HEAD or (raw.lstrip()[:5] == b"solid" and b"facet" in raw[:1024]):
+        return
+    count = int.from_bytes(raw[STL_HEAD - 4 : STL_HEAD], "little")
+    announced = STL_HEAD + STL_TRIANGLE * count
+    if announced != len(raw) and count:
+        raise ValueError(
+            f"its head announces {count} triangles, {announced} bytes; it has {len(raw)} bytes"
+        )
+
+
+_CHECKS: Final = {"glb": _check_glb, "ply": _check_ply, "stl": _check_stl}
 """What is checked of a file's claims before trimesh reads it."""
 
 

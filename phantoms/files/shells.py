@@ -1,0 +1,68 @@
+"""Shells of a mesh that lie inside others: cavities, or bodies counted once with what is around."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.geometry.conventions import FloatArray
+
+MOST_SHELLS: Final = 200
+"""Above which none is looked at."""
+Faces = npt.NDArray[Any]
+
+
+def filled_twice(vertices: FloatArray, faces: Faces) -> int:
+    """How many shells that are turned outwards lie in what other shells fill.
+
+    Such a shell changes nothing: where bodies overlap, path counts once. Cavities turn inwards.
+
+    Args:
+        vertices: (v, 3).
+        faces: (f, 3), of closed shells.
+    """
+    shells = _shells(vertices, faces)
+    if not 1 < len(shells) <= MOST_SHELLS:
+        return 0
+    corners = [vertices[faces[shell]] for shell in shells]
+    boxes = [(three.min(axis=(0, 1)), three.max(axis=(0, 1))) for three in corners]
+    count = 0
+    for i, (low, high) in enumerate(boxes):
+        within = any((a < low).all() and (high < b).all() for a, b in boxes)
+        if not within or float(np.linalg.det(corners[i]).sum()) <= 0.0:
+            continue
+        others = np.concatenate([three for j, three in enumerate(corners) if j != i])
+        count += _winding(corners[i][0, 0], others) > 0.5
+    return int(count)
+
+
+def _shells(vertices: FloatArray, faces: Faces) -> list[npt.NDArray[np.intp]]:
+    """The faces of each connected surface."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    first, last = faces.ravel(), faces[:, [1, 2, 0]].ravel()
+    size = len(vertices)
+    edges = coo_array((np.ones(len(first), bool), (first, last)), shape=(size, size))
+    _, part = connected_components(edges, directed=False)
+    of_face = part[faces[:, 0]]
+    order = np.argsort(of_face, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(of_face[order])) + 1)
+
+
+def _winding(point: FloatArray, triangles: FloatArray) -> float:
+    """How often triangles (f, 3, 3) wind about a point, by their solid angles (van Oosterom and
+    Strackee, IEEE Trans. Biomed. Eng. 30 (1983) 125).
+    """
+    a, b, c = (triangles[:, i] - point for i in range(3))
+    la, lb, lc = (np.linalg.norm(edge, axis=1) for edge in (a, b, c))
+    volume = np.einsum("ni,ni->n", a, np.cross(b, c))
+    below = (
+        la * lb * lc
+        + np.einsum("ni,ni->n", a, b) * lc
+        + np.einsum("ni,ni->n", b, c) * la
+        + np.einsum("ni,ni->n", c, a) * lb
+    )
+    return float(np.arctan2(volume, below).sum() / (2.0 * np.pi))
