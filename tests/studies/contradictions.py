@@ -564,6 +564,9 @@ def right(rng: np.random.Generator, scan: Scan, folder: Path) -> tuple[str, Told
     geometry, grid, images = scan.geometry(), scan.grid, scan.integrals()
     noisy = images + rng.normal(0.0, rng.uniform(0.0, 0.05), images.shape)
     kind = int(rng.integers(12))
+    if kind in (0, 1, 4, 10) and rng.integers(2):  # a panel aside and turned
+        geometry = scan.geometry(offset=rng.uniform(-0.1, 0.1, 2) * scan.pixel * scan.shape[1],
+                                 tilts=rng.uniform(-3, 3, 3))  # fmt: skip
     if kind == 0:
         return "project", ask(lambda: fx.project(scan.solid(), geometry))
     if kind == 1:

@@ -14,7 +14,7 @@ from flexdt.twin.plausibility.findings import Finding, Severity
 SOME_VIEWS: Final = 60
 POINTS: Final = 7
 """Points along each axis of a grid that are looked at."""
-MOST_UNSEEN: Final = 0.5
+MOST_UNSEEN: Final = 0.75
 """Share of a grid's points that lie beside the field of view; of a square about a circle, .21."""
 LEVEL: Final = 1e-3
 """Rise of the source, relative to its distance from the panel, of a circle."""
