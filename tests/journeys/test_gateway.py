@@ -188,7 +188,7 @@ def test_long_commands_say_how_far_they_are(program: Program, plain: Any) -> Non
 
 
 def test_errors_name_what_is_allowed(program: Program) -> None:
-    assert "outside [70, 996] mm" in program.fails("mag_obj", "move absolute", 5000)
+    assert "kV 200 is outside [0, 90]" in program.fails("tube", "set kV", 200)
     assert "it knows: xrayon" in program.fails("tube", "explode")
     assert "no component 'tra_sky'; the twin has" in program.fails("tra_sky", "move absolute", 1)
     assert "the twin has: scanner" in program.fails("heater", "set temp", 20)
@@ -201,14 +201,24 @@ def test_errors_name_what_is_allowed(program: Program) -> None:
     assert "not a JSON object" in event["reply"]
 
 
+def test_a_line_beyond_a_limit_ends_at_the_limit_switch(program: Program) -> None:
+    """As in a script: the FleX-ray's machine file says `on_limit = "clamp"`."""
+    program.do("mag_obj", "move absolute", 5000)
+    assert float(program.do("mag_obj", "status_position_get")) == 996.0
+    assert float(program.do("mag_obj", "set speed", 10**6)) == 50.0
+    program.do("mag_obj", "move absolute", 600)
+    program.do("mag_det", "move absolute", 1060)  # Listing 1 asks for it
+    assert float(program.do("mag_det", "status_position_get")) == 1059.0
+
+
 def test_absurd_events_end_nothing(program: Program, servers: Servers) -> None:
     """One with a lone surrogate ended the gateway, six of them the twin and the projector, too."""
     pids = children(servers.pid)
     for _ in range(8):
         program.say.send_string(json.dumps({"component": "tube\ud800", "command": "xray on"}))
     for words in (
-        ("mag_obj", "move absolute", "1e300"), ("mag_obj", "move absolute", 10**9),
-        ("mag_obj", "move absolute", -(2**70)), ("mag_obj", "set speed", "1e-300"),
+        ("mag_obj", "move absolute", "1e300"), ("mag_obj", "set speed", "1e-300"),
+        ("mag_obj", "move absolute", -(2**70)),  # the source stands before that limit
         ("tube", "set kV", 10**9), ("tube", "set power", "0"), ("camera", "set exposure", "1e9"),
         ("camera", "set ROI", "1000000 1000000 1000000 1000000"), ("camera", "set mode", "\x00"),
         ("camera", "set number of averages", "100000"), ("scanner", "run script", "\x00" * 1000),
@@ -216,6 +226,8 @@ def test_absurd_events_end_nothing(program: Program, servers: Servers) -> None:
         ("camera", "take and save image sequence", "a", -1),
     ):  # fmt: skip
         assert "internal error" not in program.fails(*words), words
+    for target in (10**9, 600):  # to a limit, as at its switch, and back
+        program.do("mag_obj", "move absolute", target)
     assert float(program.do("scanner", "status_time_get")) > 0
     assert children(servers.pid) == pids, "nobody was started again"
 
