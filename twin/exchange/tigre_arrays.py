@@ -6,8 +6,8 @@ opposite; u points to +y and the rows grow upwards at a = 0. So its angle is our
 the rows of a panel that grow downwards are a pitch of 180 deg. `offOrigin` moves source and panel
 together, `offDetector` the panel in its plane before it turns, and `rotDetector` (about x, y and z,
 the turn about z last) turns it about its centre. The angle is that of the panel's normal, so that
-TIGRE's weights of FDK, which know DSO, DSD and offDetector but no turned panel, are those of the
-real one but for pitch and roll. An attribute that is the same in all views is written once.
+DSD and DSO are those along it, which is what TIGRE's FDK weighs by; it reads offsets of a panel
+aside where one holds for all views, so an attribute that is the same in all views is written once.
 """
 
 from __future__ import annotations
