@@ -57,7 +57,7 @@ class DataSet(ImageSet):
         >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
         >>> data = DataSet.from_arrays(np.full((3, 4, 5), 500), scan, flat=np.full((4, 5), 1000))
         >>> data
-        <DataSet 'arrays': 3 projections of 4 x 5, complete, 1 warning>
+        <DataSet 'arrays': 3 projections of 4 x 5 (rows x columns), complete, 1 warning>
         >>> round(float(data[0][0, 0]), 4), len(data[1:])
         (0.6931, 2)
     """

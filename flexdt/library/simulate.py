@@ -405,8 +405,8 @@ def _panel(
         rows, cols = (n * binning for n in shape)
         if rows > spec.rows or cols > spec.columns:
             raise LimitError(
-                f"{shape[0]} x {shape[1]} pixels of {pitch:g} mm do not fit {spec.model}; allowed: "
-                f"{spec.rows // binning} x {spec.columns // binning}",
+                f"{shape[0]} x {shape[1]} pixels (rows x columns) of {pitch:g} mm do not fit "
+                f"{spec.model}; allowed: {spec.rows // binning} x {spec.columns // binning}",
                 {"asked": list(shape), "allowed": [spec.rows // binning, spec.columns // binning]},
             )
         left, top = (spec.columns - cols) // 2, (spec.rows - rows) // 2

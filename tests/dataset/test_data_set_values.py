@@ -45,7 +45,7 @@ def test_images_are_line_integrals_by_number_and_in_order(data: fx.DataSet) -> N
     assert_allclose(data[np.int64(-1)], expected[-1], atol=1e-5)
     with pytest.raises(IndexError):
         data[12]
-    assert repr(data) == "<DataSet 'scene': 12 projections of 20 x 24, complete>"
+    assert repr(data) == "<DataSet 'scene': 12 projections of 20 x 24 (rows x columns), complete>"
 
 
 def test_slices_are_data_sets(data: fx.DataSet) -> None:

@@ -40,7 +40,7 @@ def test_an_own_data_set_comes_back(written: Written, record: Make, images: Imag
     d = load_dataset(written())
     assert (d.name, len(d), d.shape) == ("scan", 5, (24, 30))
     assert d.complete
-    assert repr(d) == "<DataSet 'scan': 5 projections of 24 x 30, complete>"
+    assert repr(d) == "<DataSet 'scan': 5 projections of 24 x 30 (rows x columns), complete>"
     assert d.require_complete() is d
     assert (d.reason, d.missing, d.warnings) == ("", (), ())
     assert [f.file for f in d.frames] == [f"scan_{i:06d}.tif" for i in range(5)]

@@ -56,8 +56,8 @@ class ConeVec:
 
     Example:
         >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(760, 956), pixel=0.1496)
-        >>> scan
-        <ConeVec: 4 views, 760 x 956 pixels of 0.1496 mm, source to detector 1059 mm>
+        >>> print(repr(scan)[:51])
+        <ConeVec: 4 views, 760 x 956 pixels (rows x columns
         >>> scan.shape, scan[::2].shape
         ((4, 760, 956), (2, 760, 956))
         >>> scan == ConeVec(scan.rows, (760, 956)) == ConeVec.from_dict(scan.to_dict())
@@ -451,7 +451,7 @@ class ConeVec:
         steps = [_span(np.linalg.norm(step, axis=1)) for step in (self.u, self.v)]
         pitch = steps[0] if steps[0] == steps[1] else " x ".join(steps)
         shape = self.detector_shape
-        pixels = "pixels" if shape is None else f"{shape[0]} x {shape[1]} pixels"
+        pixels = "pixels" if shape is None else f"{shape[0]} x {shape[1]} pixels (rows x columns)"
         return {
             "views": f"{len(self)} view{'' if len(self) == 1 else 's'}",
             "detector": f"{pixels} of {pitch} mm",

@@ -115,7 +115,8 @@ class Operator:
     def __repr__(self) -> str:
         n, rows, cols = self.image_shape
         z, y, x = self.voxel_shape
-        return f"<Operator: {z} x {y} x {x} voxels to {n} views of {rows} x {cols} pixels>"
+        views = f"{n} views of {rows} x {cols} pixels (rows x columns)"
+        return f"<Operator: {z} x {y} x {x} voxels to {views}>"
 
     @property
     def voxel_shape(self) -> tuple[int, int, int]:

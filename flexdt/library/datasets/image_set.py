@@ -111,7 +111,7 @@ class ImageSet:
         >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
         >>> data = DataSet.from_arrays(np.full((3, 4, 5), 500), scan, flat=np.full((4, 5), 1000))
         >>> data
-        <DataSet 'arrays': 3 projections of 4 x 5, complete, 1 warning>
+        <DataSet 'arrays': 3 projections of 4 x 5 (rows x columns), complete, 1 warning>
         >>> round(float(data[0][0, 0]), 4), len(data[1:])
         (0.6931, 2)
     """
@@ -172,7 +172,7 @@ class ImageSet:
             >>> import numpy as np
             >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
             >>> DataSet.from_arrays(np.full((3, 4, 5), 500), scan, name="mine")
-            <DataSet 'mine': 3 projections of 4 x 5, complete, 1 warning>
+            <DataSet 'mine': 3 projections of 4 x 5 (rows x columns), complete, 1 warning>
         """
         values = np.asarray(counts)
         if values.ndim != 3 or 0 in values.shape:
@@ -224,9 +224,8 @@ class ImageSet:
         state = "complete" if self.complete else "incomplete"
         many = len(self.warnings)
         doubts = f", {many} warning{'s' if many > 1 else ''}" if many else ""
-        return (
-            f"<DataSet {self.name!r}: {len(self)} projections of {rows} x {cols}, {state}{doubts}>"
-        )
+        images = f"{len(self)} projections of {rows} x {cols} (rows x columns)"
+        return f"<DataSet {self.name!r}: {images}, {state}{doubts}>"
 
     def _repr_html_(self) -> str:
         """Show what a reader wants to know first, and the first image."""

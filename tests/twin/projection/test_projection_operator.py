@@ -57,7 +57,9 @@ def test_operator_and_transpose_are_the_matrix(operator, matrix):
     )
     assert np.array_equal(operator.T.T @ LIKE.like(x), image)
     spread += 1.0  # a result belongs to the caller
-    assert repr(operator) == "<Operator: 2 x 3 x 4 voxels to 5 views of 5 x 6 pixels>"
+    assert (
+        repr(operator) == "<Operator: 2 x 3 x 4 voxels to 5 views of 5 x 6 pixels (rows x columns)>"
+    )
     assert repr(operator.T) == repr(operator) + ".T"
 
 
