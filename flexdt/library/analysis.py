@@ -91,6 +91,7 @@ def reconstruct(
     iterations: int | None = None,
     weight: float | None = None,
     window: str = PLAIN,
+    rings: bool = False,
     material: str | Sequence[str] | None = None,
     scatter_correction: str | Sequence[str] | None = None,
     tube: Tube | None = None,
@@ -112,6 +113,7 @@ def reconstruct(
         iterations: of an iterative algorithm; default: its own.
         weight: of the total variation (tv); default: its own.
         window: of FDK's ramp filter: ram-lak, shepp-logan, cosine, hamming, hann.
+        rings: correct for rings, as far as they stand out from the noise (full turns).
         material: the object is made of this alone: correct beam hardening. For sirt and sart also
             all the materials it is made of.
         scatter_correction: the material that the object is made of, or all of them: simulate its
@@ -143,6 +145,7 @@ def reconstruct(
         iterations=iterations,
         weight=weight,
         window=window,
+        rings=rings,
         material=material,
         scatter_correction=scatter_correction,
         tube=tube,

@@ -223,8 +223,8 @@ def test_the_volume_of_a_past_scan_is_that_of_the_command(
     words = ["reconstruct", str(home), "--out", str(out), "--binning", str(last["binning"])]
     with pytest.raises(SystemExit, match="0"):
         main(words)
-    accuracy = last["doubts"][-1].removeprefix("values may be off: ")
-    assert accuracy.startswith("half of the object's even places are right within")
+    accuracy = last["doubts"][-1].removeprefix("values may be off; ")
+    assert accuracy.startswith("accuracy: within")
     assert accuracy in capsys.readouterr().out
     whole = tifffile.imread(out)  # (z, y, x)
     assert last["size"] == list(whole.shape[::-1])

@@ -1,9 +1,9 @@
 """Counts to line integrals: -log((p - d) / (f - d)), finite for every pixel.
 
-A pixel that the beam does not reach in the flat (f - d below one count) is dead: it takes the value
-of the nearest live one. A pixel without signal in the projection counts as half a count, the
-largest attenuation the data support. Nothing is smoothed, bright pixels are not clipped, and beam
-hardening is not corrected.
+A pixel that the beam does not reach in the flat (f - d below one count) is dead: it is interpolated
+between the nearest live ones of its row. A pixel without signal in the projection counts as half a
+count, the largest attenuation the data support. Nothing is smoothed, bright pixels are not clipped,
+and beam hardening is not corrected.
 """
 
 from __future__ import annotations
@@ -33,14 +33,17 @@ class LineIntegrals:
     Attributes:
         dark: mean dark image, (rows, cols) [counts].
         log_open: log of the open beam f - d, (rows, cols); 0 where dead.
-        dead: mask of dead pixels.
-        nearest: flat indices of the nearest live pixel of each dead one.
+        dead: mask of dead pixels, and of those that are interpolated as they are.
+        before, after: flat indices of the live pixels between which each of these is interpolated.
+        weight: of the latter.
     """
 
     dark: Float32Array
     log_open: Float32Array
     dead: npt.NDArray[np.bool_]
-    nearest: npt.NDArray[np.intp]
+    before: npt.NDArray[np.intp]
+    after: npt.NDArray[np.intp]
+    weight: Float32Array
 
     @classmethod
     def of(cls, dark: Float32Array, flat: Float32Array) -> LineIntegrals:
@@ -56,7 +59,14 @@ class LineIntegrals:
                 "the flat field is nowhere brighter than the dark image: was the tube off?"
             )
         log_open = np.log(np.where(dead, np.float32(1.0), opened))
-        return cls(np.asarray(dark, dtype=np.float32), log_open, dead, _nearest(dead))
+        return cls(np.asarray(dark, dtype=np.float32), log_open, dead, *_neighbours(dead))
+
+    def interpolating(self, mask: npt.NDArray[np.bool_]) -> LineIntegrals:
+        """The same with more pixels (rows, cols) interpolated, unless none would be left."""
+        dead = self.dead | mask
+        if dead.all():
+            return self
+        return LineIntegrals(self.dark, self.log_open, dead, *_neighbours(dead))
 
     def __call__(self, counts: npt.NDArray[np.generic]) -> Float32Array:
         """Line integrals of one image of counts, float32 (rows, cols), finite."""
@@ -64,8 +74,11 @@ class LineIntegrals:
         np.maximum(out, np.float32(MIN_COUNTS), out=out)
         np.log(out, out=out)
         np.subtract(self.log_open, out, out=out)
-        if len(self.nearest):
-            out[self.dead] = out.reshape(-1)[self.nearest]
+        if len(self.before):
+            flat = out.reshape(-1)
+            out[self.dead] = (1.0 - self.weight) * flat[self.before] + self.weight * flat[
+                self.after
+            ]
         return out
 
 
@@ -85,14 +98,29 @@ def of_intensities(
     return np.asarray(-np.log(np.maximum(light, np.finfo(np.float32).tiny)), dtype=np.float32)
 
 
-def _nearest(dead: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
+def _neighbours(
+    dead: npt.NDArray[np.bool_],
+) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], Float32Array]:
+    """Flat indices of the live pixels before and after each dead one in its row, and the weight of
+    the latter; of the nearest of all where a row has none on one side.
+    """
     if not dead.any():
-        return np.empty(0, dtype=np.intp)
+        none = np.empty(0, dtype=np.intp)
+        return none, none, np.empty(0, dtype=np.float32)
     from scipy.ndimage import distance_transform_edt
 
-    _, indices = distance_transform_edt(dead, return_indices=True)
-    flat = np.ravel_multi_index(tuple(i[dead] for i in indices), dead.shape)
-    return np.asarray(flat, dtype=np.intp)
+    cols = dead.shape[1]
+    column = np.broadcast_to(np.arange(cols), dead.shape)
+    before = np.maximum.accumulate(np.where(dead, -1, column), axis=1)[dead]
+    after = np.minimum.accumulate(np.where(dead, cols, column)[:, ::-1], axis=1)[:, ::-1][dead]
+    row, here = np.nonzero(dead)
+    _, (near_row, near_column) = distance_transform_edt(dead, return_indices=True)
+    nearest = (near_row * cols + near_column)[dead]
+    between = (before >= 0) & (after < cols)
+    weight = np.where(between, (here - before) / (after - before), 0.0)
+    first = np.where(between, row * cols + before, nearest)
+    second = np.where(between, row * cols + after, nearest)
+    return first.astype(np.intp), second.astype(np.intp), weight.astype(np.float32)
 
 
 def binned_mean(images: npt.NDArray[Any], factor: int | tuple[int, int]) -> npt.NDArray[Any]:

@@ -25,19 +25,23 @@ from flexdt.twin.projection.portions import PASS_NS, equal_portions
 from flexdt.twin.signatures import File, public
 
 WARNED: Final = 0.03
-"""Relative bound from which on a warning tells of it, where a tenth of the even places have more.
-The bound is two to four times what is off: about 1 %."""
+"""Relative bound from which on a warning tells of it, where a tenth of the uniform regions have
+more. The bound is two to four times what is off: about 1 %."""
 CAUSES: Final = {
-    "angles": "directions that no view saw",
-    "aside": "the few columns of the panel that see beyond the axis",
-    "cone": "the angle of the cone, more so with few views",
-    "rows": "what lies above or below the panel's rows",
-    "beyond": "what lies beyond the panel's sides",
-    "drift": "images that are not empty beside the object",
+    "angles": "missing or few views",
+    "aside": "the narrow overlap of an offset panel",
+    "cone": "the cone angle",
+    "rows": "truncation above or below the panel's rows",
+    "beyond": "truncation at the panel's sides",
+    "drift": "an open beam beside the object that is not the flat field's",
 }
-UNSEEN: Final = (
-    "; this holds if the object goes on beyond the panel's sides as it is within them: a denser "
-    "shell out there makes every value too low, and no image shows it"
+GRANTED: Final = (
+    "taken for granted: the geometry, as far as images do not contradict it, and line integrals "
+    "without beam hardening and scatter"
+)
+NOT_BOUNDED: Final = (
+    "accuracy: not bounded, because the object extends beyond the panel's sides: a denser shell "
+    "out there makes every value too low, and no image shows it"
 )
 Vector3 = tuple[float, float, float]
 IntArray = npt.NDArray[np.int32]
@@ -47,13 +51,13 @@ LANES = 16
 
 @dataclass(frozen=True)
 class Accuracy:
-    """What the even places of an object may be off by, beside the noise.
+    """What the uniform regions of an object may be off by, noise not included.
 
     Attributes:
         half: of the attenuation there, in half of them at most.
-        most: in nine of ten at most.
+        most: in nine of ten at most: the figure by which volumes are compared.
         cause: what contributes most to the others: angles, aside, cone, rows, beyond or drift.
-        cut_off: the object goes on beyond the panel's sides, where its outline is a guess.
+        cut_off: the object goes on beyond the panel's sides: the figures are estimates, no bounds.
     """
 
     half: float
@@ -62,16 +66,18 @@ class Accuracy:
     cut_off: bool = False
 
     def __str__(self) -> str:
+        if self.cut_off:
+            return f"{NOT_BOUNDED}; {GRANTED}"
         half, most = (f"{min(100.0 * part, 99.0):.2g} %" for part in (self.half, self.most))
         return (
-            f"half of the object's even places are right within {half} and nine of ten within "
-            f"{most}, beside the noise; what contributes most: {CAUSES[self.cause]}"
-        ) + UNSEEN * self.cut_off
+            f"accuracy: within {most} in nine of ten uniform regions and {half} in half of them "
+            f"(noise not included); largest cause: {CAUSES[self.cause]}; {GRANTED}"
+        )
 
     @property
     def warnings(self) -> list[str]:
-        """A warning where a tenth of the places may be off by more than some per cent."""
-        return [f"values may be off: {self}"] * (self.most > WARNED)
+        """A warning where a tenth of the regions may be off by more than some per cent."""
+        return [f"values may be off; {self}"] * (self.most > WARNED)
 
 
 @dataclass(frozen=True, eq=False)
@@ -361,6 +367,7 @@ class Volume:
     def bias_bound(self) -> Float32Array | None:
         """Bound of what each voxel is off by beside the noise, (nz, ny, nx) [1/mm], NaN where no
         data cover it (`reconstruct("fdk")`); None where it was not found. Computed at each call.
+        Where `accuracy.cut_off` it is an estimate.
         """
         bias: Any = getattr(self, "_bias", None)  # of `volume_errors.with_errors`
         found: Float32Array | None = None if bias is None else bias.bound(self)
@@ -368,8 +375,8 @@ class Volume:
 
     @property
     def accuracy(self) -> Accuracy | None:
-        """What the object's even places may be off by, in short (`reconstruct("fdk")`); None where
-        it was not found.
+        """What the object's uniform regions may be off by, in short (`reconstruct("fdk")`); None
+        where it was not found, and where the images do not fit the geometry.
 
         Example:
             >>> volume = fx.reconstruct("my-scans/lego")  # doctest: +SKIP

@@ -26,6 +26,7 @@ from flexdt.twin.projection import Grid, Volume
 from flexdt.twin.projection.volume import Accuracy
 from flexdt.twin.reconstruction.acquisition.truncation import Truncation
 from flexdt.twin.reconstruction.coarse_scan import CoarseScan
+from flexdt.twin.reconstruction.consistency.agreement import Contradiction, contradiction_of
 from flexdt.twin.reconstruction.volume_errors import interpolated
 
 SAFETY: Final = 3.0
@@ -40,6 +41,8 @@ would show as flaws of their own."""
 STEEP: Final = 0.05
 """Change between nodes, over the object's attenuation, at an edge, where blur hides what a flaw
 does."""
+MAX_VOXEL_NODES: Final = 4.0
+"""Edge of a voxel over that of a node, above which a grid cannot hold what the bound is of."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,12 +56,14 @@ class Bias:
         inside: nodes of the object, (nz, ny, nx).
         causes: angles, aside, cone, rows, beyond or drift -> what it changes at most [1/mm], (nz,
             ny, nx).
+        contradiction: between images and geometry, with which nothing is bounded.
     """
 
     found: Volume
     even: FloatArray
     inside: npt.NDArray[np.bool_]
     causes: dict[str, FloatArray]
+    contradiction: Contradiction | None = None
 
     @cached_property
     def total(self) -> Float32Array:
@@ -66,15 +71,23 @@ class Bias:
         flaws = np.sum(list(self.causes.values()), axis=0)
         return np.asarray(FLOOR * np.abs(self.found.data) + flaws, np.float32)
 
-    def bound(self, grid: Volume) -> Float32Array:
-        """Bound at each voxel of a grid, NaN where it has no value, (nz, ny, nx) [1/mm]."""
+    def bound(self, grid: Volume) -> Float32Array | None:
+        """Bound at each voxel of a grid, NaN where it has no value, (nz, ny, nx) [1/mm]; None where
+        images and geometry do not belong together.
+        """
+        if self.contradiction is not None:
+            return None
         out = interpolated(self.found.like(self.total), grid)
         for layer, values in zip(out, grid.data, strict=True):
             layer[np.isnan(values)] = np.nan
         return out
 
     def accuracy(self, grid: Grid | Volume) -> Accuracy | None:
-        """Of the object's even places in a grid; None where there is no object."""
+        """Of the object's uniform regions in a grid; None where it holds none, and where images
+        and geometry do not belong together.
+        """
+        if self.contradiction is not None or self.too_coarse(grid):
+            return None
         size = np.array(grid.shape[::-1]) * grid.voxel_mm + self.found.voxel_xyz
         near = [
             np.abs(places - middle) <= 0.5 * side
@@ -90,6 +103,11 @@ class Bias:
         half, most = np.percentile(self.total[inside] / value[inside], [50.0, 90.0])
         worst = max(off, key=lambda cause: float(np.percentile(off[cause], 90.0)))
         return Accuracy(float(half), float(most), worst, "beyond" in off)
+
+    def too_coarse(self, grid: Grid | Volume) -> bool:
+        """Whether a grid's voxels are too large to hold a uniform region."""
+        edge = np.max(grid.voxel_mm)
+        return bool(edge > MAX_VOXEL_NODES * max(self.found.voxel_xyz))
 
 
 def bias_of(
@@ -132,6 +150,9 @@ def _bias_of(scan: CoarseScan) -> Bias:
     # Half of what is about them, and a quarter of what is usual: more than streaks in the air.
     inside = (sharp > 0.5 * found) & (np.minimum(sharp, found) > 0.25 * typical) & ~unseen
     causes: dict[str, FloatArray] = {}
+    contradiction = contradiction_of(scan, data)
+    if contradiction is not None:
+        return Bias(scan.grid.like(found), even, inside, causes, contradiction)
 
     def add(cause: str, share: float, change: Float32Array) -> None:
         causes[cause] = causes.get(cause, 0.0) + share * _about(change, even)

@@ -20,7 +20,6 @@ from flexdt.twin.projection.operators import (
     require_finite,
     require_line_integrals,
 )
-from flexdt.twin.projection.volume import Accuracy
 from flexdt.twin.reconstruction.acquisition.coverage import layer_warnings, lost_layers
 from flexdt.twin.reconstruction.acquisition.truncation import truncation_of
 from flexdt.twin.reconstruction.bias import Bias, bias_of
@@ -130,19 +129,29 @@ def checked_fdk(
         return volume, said
     bias = bias_of(image, cone_vec, shape, truncation)
     volume = with_errors(volume, bias=bias)
-    return volume, [*bias_warnings(bias, volume.accuracy), *said]
+    return volume, [*bias_warnings(bias, volume), *said]
 
 
-def bias_warnings(bias: Bias | None, accuracy: Accuracy | None) -> list[str]:
-    """What a user has to be warned of: even places that may be off, or that nobody knows.
+def bias_warnings(bias: Bias | None, grid: Grid | Volume) -> list[str]:
+    """What a user has to be warned of: uniform regions that may be off, or of which nothing is
+    known.
 
     Args:
         bias: of the scan.
-        accuracy: of it in the volume's grid.
+        grid: of the volume.
     """
     if bias is None:
         return [
-            "what values may be off by is not known: a coarse copy of the scan, by which it is "
-            "found, cannot be reconstructed"
+            "accuracy is not known: a coarse copy of the scan, by which it is found, cannot be "
+            "reconstructed"
         ]
+    if bias.contradiction is not None:
+        return [str(bias.contradiction)]
+    if bias.too_coarse(grid):
+        edge = float(np.max(grid.voxel_mm))
+        return [
+            f"accuracy is not known: voxels of {edge:g} mm are too large to hold a uniform region; "
+            f"choose at most {max(bias.found.voxel_xyz):.2g} mm"
+        ]
+    accuracy = bias.accuracy(grid)
     return [] if accuracy is None else accuracy.warnings

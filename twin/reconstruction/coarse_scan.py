@@ -68,6 +68,8 @@ class CoarseScan:
         circle: of all views of the scan.
         angles: (n,) along it [rad].
         truncation: what lies beyond the edges of these images.
+        numbers: (n,) of these views among all of the scan.
+        binned: rows and columns of the panel over which a pixel is the mean.
     """
 
     images: Float32Array
@@ -75,6 +77,8 @@ class CoarseScan:
     circle: Circle
     angles: FloatArray
     truncation: Truncation | None
+    numbers: npt.NDArray[np.intp]
+    binned: tuple[int, int]
 
     @classmethod
     def of(
@@ -108,7 +112,9 @@ class CoarseScan:
             rows_of_bands = (truncation.rows + 0.5) / down - 0.5 + first
             truncation = replace(truncation, rows=rows_of_bands)
         scan = ConeVec.from_vectors(part.source, part.detector, part.u * across, part.v * down)
-        return cls(images, scan, circle, circle.angle[at[chosen]], truncation)
+        numbers = at[chosen]
+        binned = (down, across)
+        return cls(images, scan, circle, circle.angle[numbers], truncation, numbers, binned)
 
     @cached_property
     def level(self) -> ConeVec:
@@ -179,17 +185,22 @@ class CoarseScan:
 
     def seen(self, thing: Float32Array, rung: Rung) -> Float32Array:
         """Values on the grid, (nz, ny, nx), projected and reconstructed."""
-        higher = np.pad(thing, ((self.more, self.more), (0, 0), (0, 0)), "edge")
-        volume = Volume(higher, self.grid.voxel_mm, self.grid.center_mm)
-        # Two rays a column: the steps of voxels would show as a flaw of their own.
-        views, (rows, cols) = rung.cone_vec, rung.shape
-        finer = ConeVec.from_vectors(views.source, views.detector, 0.5 * views.u, views.v)
-        rays = forward(volume, finer, (rows, 2 * cols))
         truncation = self.truncation
         if truncation is not None:
             truncation = truncation.nothing if rung.flaw and truncation.beyond else None
-        images = 0.5 * (rays[:, :, ::2] + rays[:, :, 1::2])
-        return np.nan_to_num(self.fdk(images, views, truncation))
+        images = self.projected(thing, rung.cone_vec, rung.shape)
+        return np.nan_to_num(self.fdk(images, rung.cone_vec, truncation))
+
+    def projected(
+        self, thing: Float32Array, views: ConeVec, shape: tuple[int, int]
+    ) -> Float32Array:
+        """Values on the grid, (nz, ny, nx), as some views see them, (n, rows, cols)."""
+        higher = np.pad(thing, ((self.more, self.more), (0, 0), (0, 0)), "edge")
+        volume = Volume(higher, self.grid.voxel_mm, self.grid.center_mm)
+        # Two rays a column: the steps of voxels would show as a flaw of their own.
+        finer = ConeVec.from_vectors(views.source, views.detector, 0.5 * views.u, views.v)
+        rays = forward(volume, finer, (shape[0], 2 * shape[1]))
+        return np.asarray(0.5 * (rays[:, :, ::2] + rays[:, :, 1::2]), np.float32)
 
     def parallel(
         self, flaw: str, ends: tuple[float, float], turn: FloatArray | None = None

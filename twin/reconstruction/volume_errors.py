@@ -33,12 +33,12 @@ class BoundOf(Protocol):
     """What the bias of a volume is computed from."""
 
     @abstractmethod
-    def bound(self, grid: Volume) -> Float32Array:
-        """Bound at each voxel of a grid, (nz, ny, nx) [1/mm]."""
+    def bound(self, grid: Volume) -> Float32Array | None:
+        """Bound at each voxel of a grid, (nz, ny, nx) [1/mm]; None where there is none."""
 
     @abstractmethod
     def accuracy(self, grid: Volume) -> Accuracy | None:
-        """Of the object's even places in a grid; None where there is no object."""
+        """Of the object's uniform regions in a grid; None where nothing is known of them."""
 
 
 def with_errors(

@@ -30,7 +30,8 @@ def image_doubts(
     Args:
         scan: the data set.
         needed: line integrals are.
-        counts: gives those of a frame in a file by its index; None reads them.
+        counts: gives those of a frame in a file by its index; None reads them. Pixels that the data
+            set interpolates are not looked at.
 
     Raises:
         DatasetFormatError: line integrals are `needed`, and the images hold none: no pixel of the
@@ -40,6 +41,8 @@ def image_doubts(
         return []  # they were given, not exposed
     flat, dark = scan.flat, scan.dark
     alive, wanted = flat > dark, scan.present
+    if scan.interpolated is not None and (alive & ~scan.interpolated).any():
+        alive &= ~scan.interpolated
     in_files = scan.arrays is None or scan.arrays.counts is None
     look = scan.counts if counts is None or not in_files else counts
     if in_files:

@@ -105,6 +105,7 @@ class ImageSet:
         warnings: what is doubtful.
         full_scale: largest count of the panel; None where it is not known.
         truth: of a simulated data set, what lies behind it.
+        interpolated: pixels whose line integrals are interpolated, (rows, cols); None: dead ones.
 
     Example:
         >>> import numpy as np
@@ -136,6 +137,7 @@ class ImageSet:
     warnings: tuple[str, ...] = ()
     full_scale: int | None = None
     truth: Any = None
+    interpolated: npt.NDArray[np.bool_] | None = None
 
     @classmethod
     def from_arrays(
@@ -428,7 +430,8 @@ class ImageSet:
     @cached_property
     def normalisation(self) -> LineIntegrals:
         """How counts become line integrals; `dead` marks the pixels for which they cannot."""
-        return LineIntegrals.of(self.dark, self.flat)
+        plain = LineIntegrals.of(self.dark, self.flat)
+        return plain if self.interpolated is None else plain.interpolating(self.interpolated)
 
     def line_integrals(self, index: int | None = None) -> Float32Array:
         """Projections as -log((p - d) / (f - d)), always finite; the panel's distortion and lag are

@@ -26,6 +26,7 @@ import numpy as np
 from flexdt.library.datasets.image_doubts import image_doubts
 from flexdt.library.datasets.image_set import ImageSet
 from flexdt.library.extras import extension
+from flexdt.library.reconstruction.bad_pixels import without_bad_pixels
 from flexdt.library.reconstruction.kept_images import (
     CountsOnce,
     ImagesInMemory,
@@ -376,7 +377,7 @@ def reconstruct_dataset(
     accuracy = None
     if task.direct:
         accuracy = None if bias is None else bias.accuracy(task.grid)
-        doubts = [*bias_warnings(bias, accuracy), *doubts]
+        doubts = [*bias_warnings(bias, task.grid), *doubts]
     pictures = slices.write(out) if task.request.png else []
     in_force = dataset.correction
     used = parameters if parameters is not None else in_force.parameters if in_force else None
@@ -508,7 +509,7 @@ def reconstruct_volume(
     doubts = layer_warnings(lost_layers(volume.data), grid.shape[0])
     if errors:
         volume = with_errors(volume, bias=bias)
-        doubts = [*bias_warnings(bias, volume.accuracy), *doubts]
+        doubts = [*bias_warnings(bias, volume), *doubts]
     for doubt in doubts:
         warnings.warn(doubt, stacklevel=2)
     return volume
@@ -548,8 +549,9 @@ def _task(
     box = np.array([grid.center_mm - half, grid.center_mm + half])
     found = examine(operation, views.cone_vec, views.shape, grid=box)
     doubts = settled(found, GeometryError)
-    doubts += image_doubts(dataset, needed=True, counts=counts.looked_at)
-    views = replace(views, doubts=tuple(doubts))
+    mended, bad = without_bad_pixels(dataset, dataset.corrected(parameters), counts.looked_at)
+    doubts += [*bad, *image_doubts(mended, needed=True, counts=counts.looked_at)]
+    views = replace(views, dataset=mended, doubts=tuple(doubts))
     return ReconstructionTask(wanted, views, grid, counts)
 
 

@@ -1,0 +1,66 @@
+"""Pixels of a data set that do not respond as their neighbours do, interpolated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from flexdt.library.datasets.image_doubts import MAX_FROM_DISK
+from flexdt.library.datasets.image_set import Counts, ImageSet
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.reconstruction.acquisition.rectify import on_its_side
+from flexdt.twin.reconstruction.consistency.pixels import BadPixels, bad_pixels
+
+FEWEST: Final = 12
+"""Views of an object that turns, in which it is seen what stands still."""
+LEAST_TURN: Final = 0.2
+"""Spread of the sources over their distance from the axis, at least, of a scan that turns."""
+
+
+def without_bad_pixels(
+    dataset: ImageSet, cone_vec: ConeVec, counts: Callable[[int], Counts]
+) -> tuple[ImageSet, list[str]]:
+    """Interpolate the pixels of a data set that do not respond as their neighbours do.
+
+    Args:
+        dataset: the scan.
+        cone_vec: of all its frames.
+        counts: gives those of a frame by its index.
+
+    Returns:
+        The data set, and what a user has to be told.
+    """
+    found = _bad_pixels(dataset, cone_vec, counts)
+    if found is None:
+        return dataset, []
+    return replace(dataset, interpolated=found.mask), [str(found)]
+
+
+def _bad_pixels(
+    dataset: ImageSet, cone_vec: ConeVec, counts: Callable[[int], Counts]
+) -> BadPixels | None:
+    present = np.array(dataset.present)
+    if len(present) < FEWEST or not (dataset.flat > dataset.dark).any():
+        return None
+    some = present[np.unique(np.linspace(0, len(present) - 1, MAX_FROM_DISK).astype(int))]
+    views = cone_vec[some]
+    spread = np.ptp(views.source[:, :2], axis=0).max()
+    if spread < LEAST_TURN * np.linalg.norm(views.source, axis=1).max():
+        return None
+    lies = on_its_side(views)
+    middle = views.project_points(np.zeros((1, 3)), dataset.shape)[:, 0, 1 if lies else 0]
+    axis_column = float(np.median(middle))
+    if not np.isfinite(axis_column):
+        return None
+
+    def images() -> Iterator[Float32Array]:
+        for index in some.tolist():
+            image = dataset.normalisation(counts(index))
+            yield image.T if lies else image
+
+    found = bad_pixels(images, axis_column)
+    return BadPixels(found.mask.T) if found is not None and lies else found

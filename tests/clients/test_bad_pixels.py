@@ -1,0 +1,110 @@
+"""Dead, stuck and flickering pixels are interpolated and counted; clean scans lose none."""
+
+from __future__ import annotations
+
+import warnings
+
+import bias_bound
+import numpy as np
+import pytest
+
+from flexdt import DataSet
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.projection import Volume
+from flexdt.twin.reconstruction.consistency.pixels import bad_pixels
+
+SHAPE = (24, 64)
+OPEN = 30_000.0
+SCAN = ConeVec.circular(sod=200.0, sdd=400.0, angles=np.arange(90) * 4.0, shape=SHAPE, pixel=1.6)
+
+
+def counts_of(seed: int) -> np.ndarray:
+    """Counts of a cylinder with two rods off the axis, with noise, (n, rows, cols)."""
+    solids = [
+        bias_bound.Solid("cylinder", np.zeros(3), np.array([17.0, 17.0, 90.0]), 0.0, 0.03),
+        bias_bound.Solid(
+            "cylinder", np.array([9.0, 4.0, 0.0]), np.array([2.0, 2.0, 90.0]), 0.0, 0.05
+        ),
+        bias_bound.Solid("box", np.array([-7.0, 6.0, 0.0]), np.array([2.0, 3.0, 5.0]), 0.4, -0.03),
+    ]
+    integrals = bias_bound.Scan("", SCAN, SHAPE, solids, 0.0, 0.0, 0).images()
+    light = np.random.default_rng(seed).poisson(OPEN * np.exp(-integrals))
+    return np.clip(light, 0, 65535).astype(np.uint16)
+
+
+def spoilt(counts: np.ndarray, kind: str, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Counts with bad pixels, and which they are (rows, cols)."""
+    rng = np.random.default_rng(seed)
+    bad = np.zeros(SHAPE, bool)
+    if kind == "column":
+        bad[:, int(rng.integers(15, 50))] = True
+    else:
+        many = int(rng.integers(1, 51))
+        bad.reshape(-1)[rng.choice(bad.size, many, replace=False)] = True
+    made = counts.copy()
+    if kind in ("dead", "column"):
+        made[:, bad] = 0
+    elif kind == "hot":
+        made[:, bad] = 60_000
+    else:
+        off = rng.random((len(made), int(bad.sum()))) < 0.5
+        made[:, bad] = np.where(off, made[:, bad] // 3, made[:, bad])
+    return made, bad
+
+
+def reconstructed(counts: np.ndarray, **options: bool) -> tuple[Volume, list[str]]:
+    flat = np.full(SHAPE, OPEN)
+    data = DataSet.from_arrays(counts, SCAN, flat=flat, dark=np.zeros(SHAPE))
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        volume = data.reconstruct("fdk", voxel=0.8, shape=(12, 60, 60), errors=False, **options)
+    return volume, [str(one.message) for one in said]
+
+
+def body(volume: Volume) -> Float32Array:
+    """The values of the cylinder, away from edges and rods."""
+    x, y, _ = volume.centers()
+    inside = np.hypot(x, y[:, None]) < 14.0
+    for at, reach in (((9.0, 4.0), 4.0), ((-7.0, 6.0), 6.0)):
+        inside &= np.hypot(x - at[0], y[:, None] - at[1]) > reach
+    return np.asarray(volume.data[:, inside])
+
+
+@pytest.mark.parametrize("kind", ["dead", "hot", "flickering", "column"])
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.daily(4)
+def test_bad_pixels_leave_no_rings(kind: str, seed: int) -> None:
+    counts = counts_of(seed)
+    clean, said = reconstructed(counts)
+    assert not any("do not respond" in one for one in said)
+    made, bad = spoilt(counts, kind, seed)
+    found, said = reconstructed(made)
+    (told,) = (one for one in said if "do not respond as their neighbours" in one)
+    assert int(told.split()[0]) == pytest.approx(int(bad.sum()), abs=1 + 0.1 * bad.sum())
+    assert not any("starved" in one or "saturated" in one for one in said)
+    assert body(found).std() <= 1.3 * body(clean).std()
+
+
+def test_rings_are_corrected_where_there_are_some() -> None:
+    """Pixels with gains apart by 1 %: `rings` is an argument as of the command."""
+    counts = counts_of(5)
+    clean = body(reconstructed(counts)[0]).std()
+    gain = np.random.default_rng(1).normal(1.0, 0.01, SHAPE)
+    ringed = np.clip(counts * gain, 0, 65535).astype(np.uint16)
+    with_rings, without = (body(reconstructed(ringed, rings=on)[0]).std() for on in (False, True))
+    assert without < with_rings
+    # What an object about the axis gives to all views is taken for rings in part.
+    assert body(reconstructed(counts, rings=True)[0]).std() < 1.3 * clean
+
+
+def test_what_stands_still_on_the_axis_is_no_bad_pixel() -> None:
+    """A rod of two columns about the axis, and a bead of a pixel on it, that no turn moves."""
+    views = np.zeros((20, 30, 61), np.float32)
+    views[:, 12:, 30:32] += 0.8
+    views += np.random.default_rng(2).normal(0.0, 0.004, views.shape).astype(np.float32)
+    assert bad_pixels(lambda: views, 30.5) is None
+    views[:, 4, 12] += 0.5
+    found = bad_pixels(lambda: views, 30.5)
+    assert found is not None
+    assert np.argwhere(found.mask).tolist() == [[4, 12]]

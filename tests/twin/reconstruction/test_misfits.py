@@ -1,0 +1,119 @@
+"""Images that do not belong to their geometry are named; right ones, made difficult, are not.
+
+Objects are projected along rays of the study's own code, which shares nothing with the projectors.
+"""
+
+from __future__ import annotations
+
+import bias_bound
+import misfits
+import numpy as np
+import pytest
+
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.projection import Grid
+from flexdt.twin.reconstruction import bias_warnings, fdk
+from flexdt.twin.reconstruction.bias import Bias
+
+SHAPE = (30, 60)
+TURN = np.arange(100) * 3.6
+
+
+def brick(aside: float = 0.0) -> bias_bound.Scan:
+    """A box with two rods and a hole, without any symmetry."""
+    scan = ConeVec.circular(
+        sod=110.0, sdd=220.0, angles=TURN, shape=SHAPE, pixel=1.6, offset=(aside, 0.0)
+    )
+    solids = [
+        bias_bound.Solid("box", np.zeros(3), np.array([12.0, 8.0, 8.0]), 0.3, 0.02),
+        bias_bound.Solid(
+            "cylinder", np.array([6.0, 2.0, 0.0]), np.array([2.0, 2.0, 6.0]), 0.0, 0.03
+        ),
+        bias_bound.Solid(
+            "cylinder", np.array([-4.0, -3.0, 1.0]), np.array([2.5, 2.5, 4.0]), 0.0, -0.02
+        ),
+    ]
+    return bias_bound.Scan("", scan, SHAPE, solids, 0.0, 0.0, 0)
+
+
+def looked_at(kind: str, aside: float = 0.0) -> Bias:
+    """What is found where something was done to the brick's images or geometry."""
+    scan = brick(aside)
+    change, names = {**misfits.WRONG, **dict.fromkeys(misfits.RIGHT, (None, None))}[
+        kind
+    ]
+    change = change or misfits.RIGHT[kind]
+    images, geometry = change(scan.images(), scan.geometry, np.random.default_rng(3))
+    case = misfits.Case(
+        kind, np.ascontiguousarray(images, np.float32), geometry, scan, names
+    )
+    bias = misfits.looked_at(case)
+    assert bias is not None
+    return bias
+
+
+@pytest.mark.parametrize(
+    ("kind", "aside"),
+    [
+        ("mirrored", 0.0),
+        ("backward", 0.0),
+        ("interlaced", 0.0),
+        ("alphabetical", 0.0),
+        ("shifted", 0.0),
+        ("other side", 20.0),
+        ("mirrored", 20.0),
+    ],
+)
+@pytest.mark.daily(4)
+def test_what_contradicts_is_named_and_no_accuracy_is_claimed(kind: str, aside: float) -> None:
+    bias = looked_at(kind, aside)
+    assert bias.contradiction is not None
+    assert misfits.WRONG[kind][1] & set(bias.contradiction.kinds)
+    grid = Grid((16, 30, 30), 1.0)
+    assert bias.accuracy(grid) is None
+    assert bias.bound(grid.blank()) is None
+    (told,) = bias_warnings(bias, grid)
+    assert told.startswith("no accuracy is claimed: images and geometry contradict each other")
+
+
+def test_the_offset_is_right_within_half_a_pixel() -> None:
+    scan = brick()
+    moved = misfits._moved(scan.geometry, -4.0)
+    case = misfits.Case("shifted", scan.images(), moved, scan, frozenset())
+    bias = misfits.looked_at(case)
+    assert bias is not None
+    assert bias.contradiction is not None
+    figure = bias.contradiction.figures[bias.contradiction.kinds.index("offset")]
+    assert float(figure.split()[1]) == pytest.approx(4.0, abs=0.5)
+
+
+@pytest.mark.parametrize("kind", list(misfits.RIGHT))
+@pytest.mark.parametrize("aside", [0.0, 20.0])
+@pytest.mark.daily(4)
+def test_right_images_are_not_told_anything(kind: str, aside: float) -> None:
+    assert looked_at(kind, aside).contradiction is None
+
+
+def test_motion_is_no_offset() -> None:
+    found = looked_at("moving").contradiction
+    assert found is None or not found.kinds
+
+
+def test_volumes_of_voxels_that_hold_no_region_claim_nothing() -> None:
+    scan = brick()
+    with pytest.warns(UserWarning, match="accuracy is not known: voxels of 30 mm are too large"):
+        volume = fdk(scan.images(), scan.geometry, Grid((1, 1, 1), 30.0))
+    assert volume.accuracy is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("right", "most"), [(False, 0.15), (True, 0.02)])
+def test_the_study_in_its_short_form(right: bool, most: float) -> None:
+    """Drawn scans that chose no constant."""
+    good = []
+    for number in range(40):
+        case = misfits.drawn(4159, number, right=right)
+        if case is not None:
+            good.append(misfits.judged(case, misfits.looked_at(case))[1])
+    assert len(good) > 10
+    assert np.mean(good) >= 1.0 - most

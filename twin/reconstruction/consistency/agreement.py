@@ -1,0 +1,222 @@
+"""Whether the images of a scan and its geometry belong together.
+
+A coarse volume is projected again and compared with the images. How large the residual is where
+both are right depends on object and trajectory; the volume, projected and reconstructed a second
+time, shows it. Where the residual is larger, and where the reversed rotation or a panel moved aside
+fits better, other explanations are tried, each with a coarse reconstruction of its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.reconstruction.coarse_scan import CoarseScan
+from flexdt.twin.reconstruction.consistency.reprojection import Reprojection
+from flexdt.twin.reconstruction.consistency.suspects import (
+    KINDS,
+    Suspect,
+    moved,
+    reversed_turn,
+    suspects,
+)
+
+MOST_MISFIT: Final = 2.1
+"""Residual over that of the volume's second reconstruction, above which images do not fit: right
+ones come to 0.8 to 1.9 (`tests/studies/misfits.py --right`)."""
+BETTER: Final = 0.85
+"""Misfit of an explanation over that of the scan as it is said to be, below which it is better:
+right scans come to 0.95 and more."""
+MUCH_BETTER: Final = 0.7
+"""The same where the panel cuts the object off, whose outer parts no volume holds, and where the
+coarse volume shows no edges."""
+DOUBTFUL: Final = 1.4
+"""Residual over that of the second reconstruction above which all explanations are tried."""
+TELLING: Final = 0.3
+"""Residual of the second reconstruction, over the images, below which it can tell: one of few views
+or few columns beyond the axis has larger ones."""
+FEWEST_VIEWS: Final = 1.6
+"""Views for a coarse column, below which streaks hide what does not fit."""
+UNEVEN: Final = 2.0
+"""Widest over usual angle of a view, above which views are at random and weights are rough."""
+AS_GOOD: Final = 1.05
+"""Misfit over the best one's, up to which an explanation is as good."""
+PROBE: Final = 0.35
+"""By how much the panel is moved in order to see on which side it fits better [coarse columns]."""
+FAR: Final = 3.0
+"""The same where images do not fit at all [coarse columns]."""
+UNEXPLAINED: Final = (
+    "No other direction, order, mirror or offset explains it; motion during the scan does, images "
+    "in a wrong order, and images that are not line integrals of one object"
+)
+STEPS: Final = 7
+"""Times that the panel is moved on, twice as far each time."""
+
+
+@dataclass(frozen=True)
+class Contradiction:
+    """Images that do not fit their geometry.
+
+    Attributes:
+        misfit: residual over what it should be.
+        kinds: of `suspects.KINDS`, what explains it best; none where nothing does.
+        better: misfit that the best explanation leaves, over `misfit`; 1 without one.
+        figures: of the kinds.
+    """
+
+    misfit: float
+    kinds: tuple[str, ...] = ()
+    better: float = 1.0
+    figures: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        said = (
+            "no accuracy is claimed: images and geometry contradict each other; the volume, "
+            f"projected again, differs from the images {self.misfit:.2g} times as much as it should"
+        )
+        if not self.kinds:
+            return f"{said}. {UNEXPLAINED}"
+        words = [
+            KINDS[kind] + (f" {figure}" if figure else "")
+            for kind, figure in zip(self.kinds, self.figures, strict=True)
+        ]
+        return f"{said}, {100.0 * self.better:.0f} % of it if {', or '.join(words)}"
+
+
+def contradiction_of(scan: CoarseScan, values: Float32Array) -> Contradiction | None:
+    """Find whether a scan's images contradict its geometry.
+
+    Args:
+        scan: coarse.
+        values: of its volume, (nz, ny, nx), 0 where there are none.
+
+    Returns:
+        None where they fit, and of helices.
+    """
+    if scan.circle.rise:
+        return None
+    return _Trial(scan, values).verdict()
+
+
+@dataclass(frozen=True, eq=False)
+class _Tried:
+    """An explanation that was tried.
+
+    Attributes:
+        suspect: the explanation.
+        shown: its images, and its volume's; None where FDK cannot use its geometry.
+        score: its misfit over that of the scan as it is said to be.
+    """
+
+    suspect: Suspect
+    shown: Reprojection | None
+    score: float
+
+
+class _Trial:
+    """Explanations, compared with the scan as it is said to be."""
+
+    def __init__(self, scan: CoarseScan, values: Float32Array) -> None:
+        self.scan = scan
+        self.whole = scan.truncation is None or not scan.truncation.cut_off.any()
+        own = Reprojection.of(scan, scan.images, scan.cone_vec, scan.truncation, values)
+        assert own is not None  # as values are given
+        self.misfit = own.misfit
+        self.expected = self._expected(own, scan.cone_vec)
+        self.telling = self.expected < TELLING
+        self.excess = self._excess(self.misfit, self.expected)
+        step = scan.circle.step
+        enough = len(step) >= FEWEST_VIEWS * scan.images.shape[2]
+        self.even = bool(enough and step.max() <= UNEVEN * np.median(step))
+
+    def verdict(self) -> Contradiction | None:
+        """What is wrong with the scan; None where nothing is."""
+        if not self.telling.any():
+            return None
+        unfit = self.whole and self.even and self.excess > MOST_MISFIT
+        better = BETTER if self.whole and self.even and self.telling.all() else MUCH_BETTER
+        tried = [self._tried(reversed_turn(self.scan)), *self._beside(unfit)]
+        if self.excess < DOUBTFUL and min(one.score for one in tried) >= better:
+            return None
+        tried += [self._tried(one) for one in suspects(self.scan, whole=self.whole and self.even)]
+        best = min(tried, key=lambda one: one.score)
+        if best.score < better and self._explains(best):
+            as_good = [one for one in tried if one.score <= AS_GOOD * best.score]
+            named = {one.suspect.kind: one.suspect.figure for one in as_good}
+            kinds, figures = tuple(named), tuple(named.values())
+            return Contradiction(self.excess, kinds, best.score, figures)
+        return Contradiction(self.excess) if unfit else None
+
+    def _explains(self, one: _Tried) -> bool:
+        """Whether the images fit an explanation, not only better than the scan."""
+        if one.shown is None:
+            return False
+        expected = self._expected(one.shown, one.suspect.cone_vec)
+        return self._excess(one.shown.misfit, expected) <= MOST_MISFIT
+
+    def _expected(self, shown: Reprojection, cone_vec: ConeVec) -> FloatArray:
+        """Misfit of a volume's second reconstruction, infinite where there is none, (2,)."""
+        again = Reprojection.of(self.scan, shown.again, cone_vec, None)
+        return np.full(2, np.inf) if again is None else again.misfit
+
+    def _excess(self, misfit: FloatArray, expected: FloatArray) -> float:
+        """How many times larger than expected: by edges, where the coarse volume shows them."""
+        return float((misfit / expected)[1 if self.telling[1] else 0])
+
+    def _tried(self, suspect: Suspect) -> _Tried:
+        # What explains a scan explains why it seemed cut off.
+        shown = Reprojection.of(self.scan, suspect.images, suspect.cone_vec, None)
+        if shown is None:
+            return _Tried(suspect, None, np.inf)
+        ratios = (shown.misfit / self.misfit)[self.telling]
+        return _Tried(suspect, shown, float(np.exp(np.log(ratios).mean())))
+
+    def _offset(self, columns: float) -> _Tried:
+        """The panel moved along its rows [coarse columns]."""
+        said = f"by {columns * self.scan.binned[1]:+.1f} px along its rows"
+        moved_panel = moved(self.scan.cone_vec, columns)
+        return self._tried(Suspect("offset", self.scan.images, moved_panel, said))
+
+    def _beside(self, unfit: bool) -> list[_Tried]:
+        """Panels moved along their rows towards the side where images fit better.
+
+        Args:
+            unfit: images do not fit, so that far places are tried as well.
+        """
+        known = {0.0: 1.0}
+        tried: dict[float, _Tried] = {}
+
+        def score(columns: float) -> float:
+            if columns not in known:
+                tried[columns] = self._offset(columns)
+                known[columns] = tried[columns].score
+            return known[columns]
+
+        side = min((-PROBE, PROBE), key=score)
+        if unfit and score(side) >= 1.0:
+            side = min((-FAR, FAR), key=score)
+        at = side
+        for _ in range(STEPS):
+            if score(at) >= min(value for place, value in known.items() if place != at):
+                break
+            at *= 2.0
+        if len(known) > 3 or score(side) < 1.0:
+            for _ in range(2):
+                score(_lowest(known))
+        return list(tried.values())
+
+
+def _lowest(known: dict[float, float]) -> float:
+    """Where a parabola through the squares of the three lowest scores has its vertex."""
+    places = sorted(known, key=known.__getitem__)[:3]
+    squares = np.square([known[place] for place in places])
+    if not np.isfinite(squares).all():
+        return places[0]
+    bend, slope, _ = np.polyfit(places, squares, 2)
+    if bend <= 0.0:
+        return places[0]
+    return float(np.clip(-slope / (2.0 * bend), min(places), max(places)))

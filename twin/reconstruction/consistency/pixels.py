@@ -1,0 +1,192 @@
+"""Pixels that do not respond as their neighbours do: dead, stuck, hot and flickering ones.
+
+An object turns, so that what it gives to a pixel beyond its neighbours in the row it gives in few
+views. A pixel that lies beyond them by far more than other pixels do, in the root of the mean
+square over all but a few views, is a bad one; so is a column of such pixels. Near the rotation axis
+an object hardly moves: there a pixel must lie beyond its neighbours in the column, too, or the
+whole column is bad.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.geometry.conventions import Float32Array
+
+NEIGHBOURS: Final = 2
+"""Columns on either side that a pixel is compared with: of two bad columns, each has good ones."""
+TIMES: Final = 8.0
+"""Response of a bad pixel over the usual one about it."""
+LEAST: Final = 0.02
+"""Response of a bad pixel, at least: line integrals that are off by less do little harm."""
+STEEPER: Final = 3.0
+"""By how much a slope may grow towards the panel's edges, whose pixels have one side alone."""
+LEAST_AT_EDGE: Final = 0.3
+"""The same of pixels at the panel's edges."""
+PASSING: Final = 5
+"""One view of so many is left out, where a pixel lies farthest beyond its neighbours."""
+BLOCK: Final = (8, 16)
+"""Rows and columns over which the usual response is found."""
+AXIS_PART: Final = 0.2
+"""Distance from the axis within which an object may hardly move, over the panel's columns."""
+WHOLE_COLUMN: Final = 0.9
+"""Part of a column's rows that are beyond their neighbours in a bad column there."""
+MOST_PART: Final = 0.05
+"""Part of all pixels; where more seem bad, none is: the images are of another kind."""
+
+
+@dataclass(frozen=True, eq=False)
+class BadPixels:
+    """Pixels whose values say nothing.
+
+    Attributes:
+        mask: (rows, cols).
+    """
+
+    mask: npt.NDArray[np.bool_]
+
+    @property
+    def count(self) -> int:
+        """Number of bad pixels."""
+        return int(self.mask.sum())
+
+    @property
+    def columns(self) -> int:
+        """Number of columns that are bad over more than half of their rows."""
+        return int((self.mask.mean(axis=0) > 0.5).sum())
+
+    def __str__(self) -> str:
+        columns = f", {self.columns} whole columns among them" if self.columns else ""
+        return (
+            f"{self.count} pixels do not respond as their neighbours do (dead, hot or "
+            f"flickering{columns}): they are interpolated"
+        )
+
+
+def bad_pixels(views: Callable[[], Iterable[Float32Array]], axis_column: float) -> BadPixels | None:
+    """Find pixels that do not respond as their neighbours do.
+
+    Args:
+        views: gives line integrals of some views of a scan, (rows, cols) each; called twice where
+            there are bad ones: the worst make their neighbours look bad, too.
+        axis_column: where the axis falls.
+
+    Returns:
+        None where there are none.
+    """
+    first, response = _outliers(views(), axis_column)
+    if not first.any():
+        return None
+    worst = first & (response >= _largest_about(np.where(first, response, np.float32(0.0))))
+    second, _ = _outliers((_interpolated(view, worst) for view in views()), axis_column)
+    mask = worst | second
+    return BadPixels(mask) if mask.mean() <= MOST_PART else None
+
+
+def _outliers(
+    views: Iterable[Float32Array], axis_column: float
+) -> tuple[npt.NDArray[np.bool_], Float32Array]:
+    """Pixels that lie far beyond their neighbours, and by how much all do, (rows, cols)."""
+    along, down, near = _Usual(), _Usual(), slice(0, 0)
+    for view in views:
+        if min(view.shape) <= 2 * NEIGHBOURS:
+            break
+        reach = AXIS_PART * view.shape[1]
+        first = int(np.clip(np.ceil(axis_column - reach), 0, view.shape[1]))
+        near = slice(first, int(np.clip(np.floor(axis_column + reach) + 1, first, None)))
+        along.add(np.square(_beyond_neighbours(view)))
+        down.add(np.square(_beyond_neighbours(view[:, near].T).T))
+    if not along.count:
+        return np.zeros((1, 1), np.bool_), np.zeros((1, 1), np.float32)
+    response = along.root()
+    mask = _outlying(response)
+    if mask[:, near].size:
+        whole = mask[:, near].mean(axis=0) > WHOLE_COLUMN
+        mask[:, near] &= whole | _outlying(down.root())
+    return mask, response
+
+
+def _largest_about(response: Float32Array) -> Float32Array:
+    """Half of the largest response of a pixel and its neighbours in the row, (rows, cols)."""
+    from scipy.ndimage import maximum_filter
+
+    size = (1, 2 * NEIGHBOURS + 1)
+    return np.asarray(0.5 * maximum_filter(response, size, mode="nearest"), np.float32)
+
+
+def _interpolated(view: Float32Array, mask: npt.NDArray[np.bool_]) -> Float32Array:
+    """An image with some pixels interpolated along their rows, (rows, cols)."""
+    made = view.copy()
+    columns = np.arange(view.shape[1])
+    for row in np.flatnonzero(mask.any(axis=1) & ~mask.all(axis=1)):
+        bad = mask[row]
+        made[row, bad] = np.interp(columns[bad], columns[~bad], view[row, ~bad])
+    return made
+
+
+class _Usual:
+    """The root of the mean of squares without the largest of them, of images as they come."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._total: Float32Array | None = None
+        self._largest: list[Float32Array] = []
+
+    def add(self, square: Float32Array) -> None:
+        """One image of squares more, (rows, cols)."""
+        self.count += 1
+        self._total = square.copy() if self._total is None else self._total + square
+        if self.count % PASSING == 0:
+            self._largest.append(np.zeros_like(square))
+        rest = square
+        for kept in self._largest:
+            smaller = np.minimum(kept, rest)
+            np.maximum(kept, rest, out=kept)
+            rest = smaller
+
+    def root(self) -> Float32Array:
+        """Root of the mean of the others, (rows, cols)."""
+        assert self._total is not None  # as there was an image
+        rest = self._total - sum(self._largest, np.float32(0.0))
+        mean = rest / np.float32(self.count - len(self._largest))
+        return np.asarray(np.sqrt(np.maximum(mean, np.float32(0.0))), np.float32)
+
+
+def _outlying(response: Float32Array) -> npt.NDArray[np.bool_]:
+    """Where a response is far above the usual one about it, (rows, cols)."""
+    from scipy.ndimage import maximum_filter
+
+    (rows, cols), (tall, wide) = response.shape, BLOCK
+    padded = np.pad(response, ((0, -rows % tall), (0, -cols % wide)), "reflect")
+    down, across = padded.shape[0] // tall, padded.shape[1] // wide
+    blocks = padded.reshape(down, tall, across, wide).transpose(0, 2, 1, 3)
+    usual = maximum_filter(np.median(blocks.reshape(down, across, -1), axis=2), 3, mode="nearest")
+    usual = usual.repeat(tall, axis=0)[:rows].repeat(wide, axis=1)[:, :cols]
+    least = np.full(cols, LEAST)
+    least[:NEIGHBOURS] = least[-NEIGHBOURS:] = LEAST_AT_EDGE
+    return np.asarray(response > np.maximum(TIMES * usual, least))
+
+
+def _beyond_neighbours(view: Float32Array) -> Float32Array:
+    """By how much pixels lie above or below all but one of their neighbours in the row, (rows,
+    cols): one of these may be bad, too.
+    """
+    cols = view.shape[1]
+    wide = np.pad(view, ((0, 0), (NEIGHBOURS, NEIGHBOURS)), "reflect")
+    first, second, third, fourth = (wide[:, k : k + cols] for k in (0, 1, 3, 4))
+    one = np.maximum(np.minimum(first, second), np.minimum(third, fourth))
+    other = np.minimum(np.maximum(first, second), np.maximum(third, fourth))
+    low, high = np.minimum(one, other), np.maximum(one, other)
+    for ends in (slice(NEIGHBOURS), slice(-NEIGHBOURS, None)):
+        span = STEEPER * (high[:, ends] - low[:, ends])  # a slope goes on beyond them
+        low[:, ends] -= span
+        high[:, ends] += span
+    np.subtract(low, view, out=low)
+    np.subtract(view, high, out=high)
+    np.maximum(low, high, out=low)
+    return np.maximum(low, np.float32(0.0), out=low)

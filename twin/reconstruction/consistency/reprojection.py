@@ -1,0 +1,102 @@
+"""A coarse volume projected again, beside the images that it was reconstructed from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexdt.twin.errors import GeometryError
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.reconstruction.acquisition.truncation import Truncation
+from flexdt.twin.reconstruction.coarse_scan import CoarseScan
+
+MEDIAN_OF_SQUARES = 0.4549
+"""Median of the squares of normal deviates."""
+LEAST_SIGNAL = 0.3
+"""Part of a misfit that is kept whatever the noise: its estimate is never all of the residual."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reprojection:
+    """Images, and what a volume of them gives when it is projected again.
+
+    Attributes:
+        images: (n, rows, cols) line integrals.
+        again: of the volume, (n, rows, cols).
+    """
+
+    images: Float32Array
+    again: Float32Array
+
+    @classmethod
+    def of(
+        cls,
+        scan: CoarseScan,
+        images: Float32Array,
+        cone_vec: ConeVec,
+        truncation: Truncation | None,
+        values: Float32Array | None = None,
+    ) -> Reprojection | None:
+        """Reconstruct images as of a geometry, and project the volume.
+
+        Args:
+            scan: gives the grid.
+            images: (n, rows, cols).
+            cone_vec: n views.
+            truncation: what lies beyond their edges.
+            values: of the volume, where they are known, (nz, ny, nx).
+
+        Returns:
+            None where FDK cannot use the geometry.
+        """
+        if values is None:
+            try:
+                values = np.nan_to_num(scan.fdk(images, cone_vec, truncation))
+            except GeometryError:
+                return None
+        shape = (images.shape[1], images.shape[2])
+        return cls(images, scan.projected(values, cone_vec, shape))
+
+    @property
+    def misfit(self) -> FloatArray:
+        """Root mean square of the residual over that of the images, beside the noise: of the
+        values, and of their changes along rows, which scatter and beam hardening hardly alter,
+        (2,).
+        """
+        rest = self.again - self.images
+        # What differs between neighbours in both is the object's.
+        noise = max(_noise_of(self.images) - _noise_of(self.again), 0.0)
+        found = []
+        for filtered, share in ((_values, 1.0), (_changes, 0.25)):
+            residual = float(np.square(filtered(rest)).mean())
+            signal = float(np.square(filtered(self.images)).mean())
+            beside = max(residual - share * noise, LEAST_SIGNAL * residual)
+            found.append(np.sqrt(beside / max(signal, float(np.finfo(np.float32).tiny))))
+        return np.asarray(found)
+
+
+def _values(images: Float32Array) -> Float32Array:
+    return images
+
+
+def _changes(images: Float32Array) -> Float32Array:
+    """Changes between neighbouring columns of smoothed rows; their variance is a quarter of that of
+    white noise.
+    """
+    smooth = 0.25 * images[..., :-2] + 0.5 * images[..., 1:-1] + 0.25 * images[..., 2:]
+    return np.diff(smooth, axis=-1)
+
+
+def _noise_of(images: Float32Array) -> float:
+    """Variance of white noise in images, (n, rows, cols).
+
+    From mixed differences of four neighbours, to which an object gives little in most of the views.
+    """
+    if images.shape[1] > 1:
+        mixed, terms = np.diff(np.diff(images, axis=2), axis=1), 4.0
+    else:
+        mixed, terms = np.diff(images, n=2, axis=2), 6.0
+    typical = np.median(np.square(mixed), axis=0) / MEDIAN_OF_SQUARES / terms
+    return float(typical.mean())

@@ -1,0 +1,147 @@
+"""What may be wrong with a scan: images and geometries as they would be if it were."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.reconstruction.coarse_scan import CoarseScan
+
+INTERLACED: Final = (2, 3, 4)
+"""Passes of interlaced scans that are tried."""
+CENTRED: Final = 0.25
+"""Distance of the axis from the middle of the panel that is none [coarse columns or rows]."""
+
+KINDS: Final = {
+    "direction": "the rotation runs the other way",
+    "columns": "images are mirrored left to right",
+    "rows": "images are mirrored top to bottom",
+    "turned": "images are turned by 180 degrees",
+    "listed": "images are in the order of their angles",
+    "interlaced": "the scan was interlaced, its images in the order of exposure:",
+    "names": "images are in the alphabetical order of their numbers (1, 10, 2)",
+    "span": "the views span",
+    "sign": "the panel is offset to the other side",
+    "middle": "the panel has no offset",
+    "height": "the panel's offset along the axis has the other sign",
+    "offset": "the panel, or the axis, is moved:",
+}
+"""What is tried, and its words."""
+
+
+@dataclass(frozen=True, eq=False)
+class Suspect:
+    """A scan as it would be if something were wrong with it.
+
+    Attributes:
+        kind: of `KINDS`.
+        images: (n, rows, cols).
+        cone_vec: n views.
+        figure: what is right instead, in words; "" where the kind says all.
+    """
+
+    kind: str
+    images: Float32Array
+    cone_vec: ConeVec
+    figure: str = ""
+
+
+def reversed_turn(scan: CoarseScan) -> Suspect:
+    """The scan with the rotation the other way."""
+    turn = 2.0 * (scan.angles[0] - scan.angles)
+    return Suspect("direction", scan.images, turned(scan, turn))
+
+
+def suspects(scan: CoarseScan, *, whole: bool) -> Iterator[Suspect]:
+    """All but the reversed rotation and other distances of the panel.
+
+    Args:
+        scan: coarse.
+        whole: the panel sees the object whole; where it does not, only panels on the wrong side and
+            mirrored images are suspected, which make an object seem cut off.
+    """
+    images, cone_vec = scan.images, scan.cone_vec
+    aside, above = _axis_from_middle(scan)
+    offset = abs(aside) > CENTRED
+    if whole or offset:
+        yield Suspect("columns", np.ascontiguousarray(images[:, :, ::-1]), cone_vec)
+    if offset:
+        yield Suspect("sign", images, moved(cone_vec, 2.0 * aside))
+        yield Suspect("middle", images, moved(cone_vec, aside))
+    if not whole:
+        return
+    yield Suspect("rows", np.ascontiguousarray(images[:, ::-1]), cone_vec)
+    yield Suspect("turned", np.ascontiguousarray(images[:, ::-1, ::-1]), cone_vec)
+    yield from _orders(scan)
+    if abs(above) > CENTRED:
+        yield Suspect("height", images, moved(cone_vec, 0.0, 2.0 * above))
+
+
+def turned(scan: CoarseScan, turn: FloatArray) -> ConeVec:
+    """The views turned about the axis, each by its own angle (n,) [rad]."""
+    cos, sin, centre = np.cos(turn), np.sin(turn), np.append(scan.circle.centre, 0.0)
+
+    def about(vectors: FloatArray) -> FloatArray:
+        x, y, z = vectors.T
+        return np.column_stack([cos * x - sin * y, sin * x + cos * y, z])
+
+    views = scan.cone_vec
+    source, panel = (about(place - centre) + centre for place in (views.source, views.detector))
+    return ConeVec.from_vectors(source, panel, about(views.u), about(views.v))
+
+
+def moved(cone_vec: ConeVec, along: float, down: float = 0.0) -> ConeVec:
+    """Panels moved along their rows and down their columns [pixels]."""
+    panel = cone_vec.detector + along * cone_vec.u + down * cone_vec.v
+    return ConeVec.from_vectors(cone_vec.source, panel, cone_vec.u, cone_vec.v)
+
+
+def _orders(scan: CoarseScan) -> Iterator[Suspect]:
+    """Images that belong to other angles of the scan."""
+    angle = scan.circle.angle
+    count = len(angle)
+    for kind, order, figure in _permutations(angle):
+        turn = angle[order][scan.numbers] - scan.angles
+        yield Suspect(kind, scan.images, turned(scan, turn), figure)
+    run = np.unwrap(angle) - angle[0]
+    span = float(np.ptp(run)) * count / max(count - 1, 1)
+    for times in (0.5, 2.0):
+        figure = f"{np.rad2deg(times * span):.0f} and not {np.rad2deg(span):.0f} degrees"
+        turn = (times - 1.0) * run[scan.numbers]
+        yield Suspect("span", scan.images, turned(scan, turn), figure)
+
+
+def _permutations(angle: FloatArray) -> Iterator[tuple[str, npt.NDArray[np.intp], str]]:
+    """Kinds of orders, and the view whose angle each image has, (n,)."""
+    count, listed = len(angle), np.arange(len(angle))
+    steps = np.diff(np.unwrap(angle))
+    if (steps > 0.0).all() or (steps < 0.0).all():
+        for passes in INTERLACED:
+            order = np.concatenate([listed[first::passes] for first in range(passes)])
+            yield "interlaced", order, f"in {passes} passes"
+        names = np.array(sorted(range(count), key=str))
+        yield "names", names, ""
+        return
+    yield "listed", np.argsort(angle, kind="stable"), ""
+
+
+def _axis_from_middle(scan: CoarseScan) -> tuple[float, float]:
+    """Where the source's foot on the axis falls from the middle of the panel, along rows and down
+    columns, over all views [coarse pixels].
+    """
+    shape = (scan.images.shape[1], scan.images.shape[2])
+    x, y = scan.circle.centre
+    foot = np.column_stack([np.full(len(scan.angles), x), np.full(len(scan.angles), y),
+                            scan.cone_vec.source[:, 2]])  # fmt: skip
+    at = np.array([
+        scan.cone_vec[k : k + 1].project_points(foot[k : k + 1], shape)[0, 0]
+        for k in range(0, len(foot), max(1, len(foot) // 8))
+    ])  # fmt: skip
+    along, down = at.mean(axis=0) - (np.array(shape[::-1]) - 1.0) / 2.0
+    return float(along), float(down)
