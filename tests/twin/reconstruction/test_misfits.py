@@ -106,6 +106,22 @@ def test_volumes_of_voxels_that_hold_no_region_claim_nothing() -> None:
     assert volume.accuracy is None
 
 
+@pytest.mark.parametrize("kind", ["flats that disagree", "falling beam"])
+def test_an_open_beam_that_is_not_the_flat_is_no_truncation(kind: str) -> None:
+    """A flat that is 1.25 times as bright as the scan's beam, and a beam that falls by a fifth: the
+    bound holds, and says why."""
+    scan = brick()
+    images = scan.images()
+    when = np.linspace(0.0, 1.0, len(images)) if kind == "falling beam" else np.ones(len(images))
+    images = images + np.float32(np.log(1.25)) * when[:, None, None].astype(np.float32)
+    with pytest.warns(UserWarning, match="an open beam beside the object that is not the flat"):
+        volume = fdk(images, scan.geometry, Grid((16, 30, 30), 1.0))
+    uniform = slice(6, 10), slice(14, 19), slice(13, 17)
+    assert volume.bias_bound is not None
+    error = abs(float(volume.data[uniform].mean()) - 0.02)
+    assert 0.05 * 0.02 < error <= volume.bias_bound[uniform].mean()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("right", "most"), [(False, 0.15), (True, 0.02)])
 def test_the_study_in_its_short_form(right: bool, most: float) -> None:

@@ -53,6 +53,12 @@ deviate from the prism by half of it: what deviated by less was right within 1 %
 were up to 4 % off (an octagon of twice the field of view) deviate by 0.6 % and more. A tenth of it
 at the edges is nothing."""
 
+EDGE_BINS = 2
+"""Bins of columns at either edge that show the same where no object is."""
+MAX_SPREAD, MAX_SLOPE = 0.02, 0.003
+"""Largest standard deviation of a view's edges over the contrast of the object, and largest step
+between these bins over their values: a cylinder of four times the panel has just that slope."""
+
 
 @dataclass(frozen=True, eq=False)
 class Prism:
@@ -306,6 +312,8 @@ def _fitted(
     seen /= np.diff(limits)[:, None] * np.diff(bins)
     seen /= np.sqrt(1.0 + up[:, :, None] ** 2 / (rays**2).sum(axis=-1)[:, None])
     seen = seen.astype(np.float64)
+    if _open_beam(seen):
+        return None
     prisms: list[Prism | None] = [None] * len(middles)
     others: list[Prism | None] = [None] * len(middles)
     cut_off, known = np.zeros(len(middles), dtype=bool), None
@@ -325,6 +333,24 @@ def _fitted(
     if not cut_off.any():
         return None
     return Truncation(middles, tuple(prisms), cut_off, tuple(others))
+
+
+def _open_beam(seen: FloatArray) -> bool:
+    """Whether both edges show one value in each view, in all rows and without a slope: an open beam
+    that is not the flat field's, and no object, whose outline slopes.
+
+    Args:
+        seen: (views, bands, bins) line integrals.
+    """
+    if seen.shape[2] < 4 * EDGE_BINS:
+        return False
+    edges = np.concatenate([seen[..., :EDGE_BINS], seen[..., -EDGE_BINS:]], axis=2)
+    edges = edges.reshape(len(seen), -1)
+    usual = float(np.median(edges))
+    contrast = float(np.percentile(seen, 90.0)) - usual
+    inwards = seen[..., 1] - seen[..., 0] + seen[..., -2] - seen[..., -1]
+    level = abs(float(inwards.mean())) < 2.0 * MAX_SLOPE * abs(usual)
+    return level and contrast > 0.0 and float(edges.std(axis=1).max()) < MAX_SPREAD * contrast
 
 
 def _noise(lines: npt.NDArray[np.floating]) -> float:

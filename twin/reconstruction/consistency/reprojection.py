@@ -14,6 +14,8 @@ from flexdt.twin.reconstruction.coarse_scan import CoarseScan
 
 MEDIAN_OF_SQUARES = 0.4549
 """Median of the squares of normal deviates."""
+MORE_NOISE = 1.5
+"""Variance of noise over what its median says: few photons give more large deviations."""
 LEAST_SIGNAL = 0.3
 """Part of a misfit that is kept whatever the noise: its estimate is never all of the residual."""
 
@@ -67,7 +69,7 @@ class Reprojection:
         """
         rest = self.again - self.images
         # What differs between neighbours in both is the object's.
-        noise = max(_noise_of(self.images) - _noise_of(self.again), 0.0)
+        noise = MORE_NOISE * max(_noise_of(self.images) - _noise_of(self.again), 0.0)
         found = []
         for filtered, share in ((_values, 1.0), (_changes, 0.25)):
             residual = float(np.square(filtered(rest)).mean())
