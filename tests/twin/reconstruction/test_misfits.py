@@ -39,14 +39,10 @@ def brick(aside: float = 0.0) -> bias_bound.Scan:
 def looked_at(kind: str, aside: float = 0.0) -> Bias:
     """What is found where something was done to the brick's images or geometry."""
     scan = brick(aside)
-    change, names = {**misfits.WRONG, **dict.fromkeys(misfits.RIGHT, (None, None))}[
-        kind
-    ]
+    change, names = {**misfits.WRONG, **dict.fromkeys(misfits.RIGHT, (None, None))}[kind]
     change = change or misfits.RIGHT[kind]
     images, geometry = change(scan.images(), scan.geometry, np.random.default_rng(3))
-    case = misfits.Case(
-        kind, np.ascontiguousarray(images, np.float32), geometry, scan, names
-    )
+    case = misfits.Case(kind, np.ascontiguousarray(images, np.float32), geometry, scan, names)
     bias = misfits.looked_at(case)
     assert bias is not None
     return bias
