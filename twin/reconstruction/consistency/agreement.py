@@ -45,6 +45,8 @@ UNEVEN: Final = 2.0
 """Widest over usual angle of a view, above which views are at random and weights are rough."""
 AS_GOOD: Final = 1.05
 """Misfit over the best one's, up to which an explanation is as good."""
+ALL_NOISE: Final = 0.01
+"""Part of a residual that is no noise even where noise explains all of it."""
 PROBE: Final = 0.35
 """By how much the panel is moved in order to see on which side it fits better [coarse columns]."""
 FAR: Final = 3.0
@@ -125,10 +127,10 @@ class _Trial:
         self.whole = scan.truncation is None or not scan.truncation.cut_off.any()
         own = Reprojection.of(scan, scan.images, scan.cone_vec, scan.truncation, values)
         assert own is not None  # as values are given
-        self.misfit = own.misfit
+        self.misfit = own.misfit()
         self.expected = self._expected(own, scan.cone_vec)
         self.telling = self.expected < TELLING
-        self.excess = self._excess(self.misfit, self.expected)
+        self.excess = self._excess(own, self.expected)
         step = scan.circle.step
         enough = len(step) >= FEWEST_VIEWS * scan.images.shape[2]
         self.even = bool(enough and step.max() <= UNEVEN * np.median(step))
@@ -156,23 +158,23 @@ class _Trial:
         if one.shown is None:
             return False
         expected = self._expected(one.shown, one.suspect.cone_vec)
-        return self._excess(one.shown.misfit, expected) <= MOST_MISFIT
+        return self._excess(one.shown, expected) <= MOST_MISFIT
 
     def _expected(self, shown: Reprojection, cone_vec: ConeVec) -> FloatArray:
         """Misfit of a volume's second reconstruction, infinite where there is none, (2,)."""
         again = Reprojection.of(self.scan, shown.again, cone_vec, None)
-        return np.full(2, np.inf) if again is None else again.misfit
+        return np.full(2, np.inf) if again is None else again.misfit()
 
-    def _excess(self, misfit: FloatArray, expected: FloatArray) -> float:
+    def _excess(self, shown: Reprojection, expected: FloatArray) -> float:
         """How many times larger than expected: by edges, where the coarse volume shows them."""
-        return float((misfit / expected)[1 if self.telling[1] else 0])
+        return float((shown.misfit(ALL_NOISE) / expected)[1 if self.telling[1] else 0])
 
     def _tried(self, suspect: Suspect) -> _Tried:
         # What explains a scan explains why it seemed cut off.
         shown = Reprojection.of(self.scan, suspect.images, suspect.cone_vec, None)
         if shown is None:
             return _Tried(suspect, None, np.inf)
-        ratios = (shown.misfit / self.misfit)[self.telling]
+        ratios = (shown.misfit() / self.misfit)[self.telling]
         return _Tried(suspect, shown, float(np.exp(np.log(ratios).mean())))
 
     def _offset(self, columns: float) -> _Tried:

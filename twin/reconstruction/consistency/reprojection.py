@@ -17,7 +17,8 @@ MEDIAN_OF_SQUARES = 0.4549
 MORE_NOISE = 1.5
 """Variance of noise over what its median says: few photons give more large deviations."""
 LEAST_SIGNAL = 0.3
-"""Part of a misfit that is kept whatever the noise: its estimate is never all of the residual."""
+"""Part of a residual that is kept whatever the noise, so that of two in much noise none is far
+better than the other."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,11 +62,13 @@ class Reprojection:
         shape = (images.shape[1], images.shape[2])
         return cls(images, scan.projected(values, cone_vec, shape))
 
-    @property
-    def misfit(self) -> FloatArray:
+    def misfit(self, least: float = LEAST_SIGNAL) -> FloatArray:
         """Root mean square of the residual over that of the images, beside the noise: of the
         values, and of their changes along rows, which scatter and beam hardening hardly alter,
         (2,).
+
+        Args:
+            least: part of the residual that is kept whatever the noise.
         """
         rest = self.again - self.images
         # What differs between neighbours in both is the object's.
@@ -74,7 +77,7 @@ class Reprojection:
         for filtered, share in ((_values, 1.0), (_changes, 0.25)):
             residual = float(np.square(filtered(rest)).mean())
             signal = float(np.square(filtered(self.images)).mean())
-            beside = max(residual - share * noise, LEAST_SIGNAL * residual)
+            beside = max(residual - share * noise, least * residual)
             found.append(np.sqrt(beside / max(signal, float(np.finfo(np.float32).tiny))))
         return np.asarray(found)
 
