@@ -103,7 +103,7 @@ class Found:
         odds: logarithm of the odds of each cause, by name; borders by their place.
         applied: names of causes that are columns of the fit.
         open: names of causes that the data neither show nor exclude.
-        strain: of the phantom, averaged: (10,) and its covariance (10, 10); None: it is not judged.
+        strain: of the phantom, (10,) and its covariance (10, 10); None: it is not judged.
     """
 
     odds: dict[str, float] = field(default_factory=dict)
@@ -283,9 +283,9 @@ class Candidates:
             out[cause.name] = _total(sides[1]) - _total(sides[0])
         return out
 
-    def left_open(self, choice: Choice, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Mean of the first columns over all choices, and covariance about a choice; and the
-        covariance of the choice itself.
+    def left_open(self, choice: Choice) -> tuple[FloatArray, FloatArray]:
+        """Covariance of the geometry's columns over all choices about one, and that of the choice
+        itself.
 
         Choices with wider priors are left out: what is said of the scanner is believed where the
         images do not contradict it.
@@ -298,21 +298,17 @@ class Candidates:
             if m is not None and c[-1] == choice[-1] and m.evidence > at.evidence - WEIGHED
         ]
         weights = np.exp(np.array([m.evidence for m in some]) - at.evidence)
-        middle, spread = averaged(some, weights / weights.sum(), count, at)
-        return at.mean[:count] + middle, spread, at.covariance(count)
+        _, spread = averaged(some, weights / weights.sum(), self.count, at)
+        return spread, at.covariance(self.count)
 
     def strain(self, choice: Choice) -> tuple[FloatArray, FloatArray] | None:
-        """The phantom's strain (10,) averaged over all choices, and its covariance; None where it
-        has none in some."""
-        if not min(self.known.strain) > 0:
+        """The phantom's strain (10,) in a choice, and its covariance; None where it has none."""
+        at = self.judged(choice)
+        if at is None or not min(self.known.strain) > 0:
             return None
         last = self.count + len(STRAINS)
-        at = self.judged(choice)
-        assert at is not None
-        middle, spread, _ = self.left_open(choice, last)
-        off = middle - at.mean[:last]
         own = slice(self.count, last)
-        return middle[own], (spread - np.outer(off, off))[own, own]
+        return at.mean[own], at.covariance(last)[own, own]
 
     def width(self, choice: Choice, name: str) -> float:
         """Width of a cause in a choice; 0: it is not chosen, or not in the table."""
@@ -389,7 +385,7 @@ def explained_by_causes(fit: FitResult, known: Known, refit: Refit) -> tuple[Fit
 
 def _widened(fit: FitResult, candidates: Candidates, choice: Choice) -> FitResult:
     """The fit with what the choices differ by in its covariance."""
-    _, spread, own = candidates.left_open(choice, candidates.count)
+    spread, own = candidates.left_open(choice)
     factor = [edge_factor(n) for n in fit.problem.layout.names[: candidates.count]]
     more = (spread - own) * np.outer(factor, factor)
     values, vectors = np.linalg.eigh(more)
