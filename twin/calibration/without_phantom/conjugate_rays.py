@@ -40,8 +40,10 @@ VIEWS_OVER: Final = 4.0
 """The smoothing's sigma is this part of what the panel's width turns by between views, at least."""
 EDGE: Final = 8
 """Views repeated at both ends for the splines over the angle."""
-ROUNDS: Final = 4
-"""Steps towards the axis column."""
+ROUNDS, NEAR = 4, 0.05
+"""Steps towards the axis column at most, and part of a sigma that is none."""
+PER_SIGMA: Final = 3.0
+"""Distances from the axis that are read in a sigma of the smoothing, at least a column apart."""
 BINS: Final = 24
 """Distances from the axis are taken together in up to so many bins."""
 WIDE: Final = 2.0
@@ -264,6 +266,8 @@ class ConjugateRays:
                 return values, math.inf
             shift, sigma = _left_out(moved.sum(axis=1), told.sum(axis=1))
             values[0] -= shift / 2.0 / slope
+            if abs(shift) < NEAR * sigma:
+                break
         return values, sigma / 2.0
 
     def profile(self, values: FloatArray) -> Profile | None:
@@ -284,11 +288,12 @@ class ConjugateRays:
         of_bin = (place[:, None] == np.arange(count)).astype(np.float64)
         moved, told = moved @ of_bin, told @ of_bin
         good = np.bincount(place, weight) > ALIKE * np.bincount(place, power)
-        if good.sum() < FEWEST_BINS:
-            return None
         shift, sigma = np.ones((2, count))
         for i in np.flatnonzero(good).tolist():
             shift[i], sigma[i] = _left_out(moved[:, i], told[:, i])
+        good &= np.isfinite(sigma)
+        if good.sum() < FEWEST_BINS:
+            return None
         kept, renumbered = good[place], np.cumsum(good) - 1
         radius, weight, place = radius[kept], weight[kept].clip(1e-30), renumbered[place[kept]]
         return Profile.of(radius, weight, place, shift[good], sigma[good], self.smoothing)
@@ -298,7 +303,8 @@ class ConjugateRays:
         times slopes and of slopes of one end times those of the other, (SECTORS, k) each; the
         power of slopes (k,)."""
         axis = self.scan.column(values, self.row)
-        radius = np.arange(0.5, min(self.cols - 1 - axis, axis) - 3.0 * self.smoothing)
+        apart_px = max(1.0, self.smoothing / PER_SIGMA)
+        radius = np.arange(0.5, min(self.cols - 1 - axis, axis) - 3.0 * self.smoothing, apart_px)
         apart, own, other = np.zeros((3, self.views, len(self.rows), len(radius)))
         little = 0.25 + 0.25 * self.smoothing
         columns = axis + radius
@@ -345,9 +351,13 @@ class ConjugateRays:
 
 
 def _left_out(moved: FloatArray, told: FloatArray) -> tuple[float, float]:
-    """Give a ratio of sums over sectors (SECTORS,), and its sigma from leaving out each."""
+    """Give a ratio of sums over sectors (SECTORS,), and its sigma from leaving out each; inf where
+    one sector has it all."""
     count = len(told)
-    without = (moved.sum() - moved) / (told.sum() - told)
+    rest = told.sum() - told
+    if not (told.sum() > 0.0 and rest.min() > 0.0):
+        return 0.0, math.inf
+    without = (moved.sum() - moved) / rest
     scatter = np.square(without - without.mean()).sum() * (count - 1) / count
     return float(moved.sum() / told.sum()), float(np.sqrt(scatter)) + 1e-6
 
