@@ -166,6 +166,23 @@ def test_a_mesh_file_is_sent_and_put_on_the_stage(
     assert flexdt("sample", "normal-3")[0] == 0
 
 
+def test_uploads_and_corrections_are_deleted_unless_they_are_in_use(
+    flexdt: Flexdt, document: Document, tmp_path: Path
+) -> None:
+    file = tmp_path / "gone soon.stl"
+    trimesh.creation.box((1.0, 2.0, 3.0)).export(file)
+    name = document("sample", str(file))["sample"]["name"]
+    code, _, err = flexdt("delete", "sample", name)
+    assert (code, "stands on the stage" in err) == (3, True)
+    assert flexdt("sample", "normal-3")[0] == 0
+    assert document("delete", "sample", name) == {"name": name, "bytes": file.stat().st_size}
+    assert name not in {one["name"] for one in document("sample")["samples"]}
+    code, _, err = flexdt("delete", "sample", name)
+    assert (code, f"no upload called {name!r}" in err) == (1, True)
+    code, _, err = flexdt("delete", "correction", "never made")
+    assert (code, "no correction called 'never made'" in err) == (1, True)
+
+
 def test_sample_and_snap(flexdt: Flexdt, document: Document, tmp_path: Path) -> None:
     listed = document("sample")["samples"]
     assert {"lego", "normal", "chiral"} <= {s["name"] for s in listed}
