@@ -64,14 +64,20 @@ class Figures:
     ping_ms: float
     set_wall_ms: float
 
-    def grown(self, young: Figures, allowed: float) -> list[str]:
-        """Names of figures that have grown by more than a part, or the start by more than 2 s."""
+    def grown(self, young: Figures, allowed: float, *, times: bool) -> list[str]:
+        """Names of figures that have grown by more than a part, or the start by more than 2 s.
+
+        Args:
+            young: those of a young directory.
+            allowed: the part.
+            times: whether processor times decide, too.
+        """
         small = {"ms": SMALL_MS, "bytes": SMALL_BYTES, "mb": SMALL_MB}
         found = []
         for field in fields(self):
             before, now = getattr(young, field.name), getattr(self, field.name)
             unit = field.name.rpartition("_")[2]
-            if field.name in ("ping_ms", "set_wall_ms"):
+            if field.name in ("ping_ms", "set_wall_ms") or (unit in ("s", "ms") and not times):
                 continue
             most = before + START_S if unit == "s" else before * (1 + allowed) + small[unit]
             if now > most:
@@ -200,6 +206,7 @@ def main() -> int:
     p.add_argument("--scans", type=int, default=1000)
     p.add_argument("--requests", type=int, default=100, help="measured at each age")
     p.add_argument("--allowed", type=float, default=0.2, help="growth, as a part")
+    p.add_argument("--no-times", action="store_true", help="let bytes and memory decide alone")
     options = p.parse_args()
     print(f"{machine()}; Python's own time in ms of processor time a request", flush=True)
     wrong = []
@@ -214,7 +221,7 @@ def main() -> int:
                         options.corrections // part, options.scans // part)  # fmt: skip
                 old.measured()
                 now = old.measured()
-                grown = now.grown(young, options.allowed)
+                grown = now.grown(young, options.allowed, times=not options.no_times)
                 wrong += [f"aged by 1/{part}: {words}" for words in grown]
                 print(f"aged by 1/{part}: {now}", flush=True)
         finally:
