@@ -184,6 +184,12 @@ def test_blank_lines_and_carriage_returns_are_white_space() -> None:
     assert Connection().receive_data(b"\n \r\n" + LINE[:-1] + b"\r\n\n") == [PING]
 
 
+def test_a_byte_order_mark_before_a_document_says_nothing() -> None:
+    mark = b"\xef\xbb\xbf"  # .NET's streams begin with it
+    assert Connection().receive_data(mark + LINE) == [PING]
+    assert Connection().receive_data(LINE + mark + LINE) == [PING, PING]
+
+
 MALFORMED_JSON = [
     b"\xff\xfe{}",
     b'{"jsonrpc":"2.0","id":1,"method":"\xff"}',
@@ -193,7 +199,7 @@ MALFORMED_JSON = [
     b'{"a":' * 100_000,
     b'"' + b"x" * 1000,
     b"{}{}",
-    b"\xef\xbb\xbf{}",
+    b"\xef\xbb\xbf\xef\xbb\xbf{}",
     b'{"jsonrpc":"2.0","id":1,"method":"x","params":[' + b"9" * 10_000 + b"]}",
     b"nul",
 ]
