@@ -96,12 +96,12 @@ def scored(kind: str, seed: int) -> Scored:
         said: tuple[str, ...] = (f"refused: {error}",)
         return Scored(kind, seed, _verdict(scan, said, False), False, 0.0, "", said)
     said = tuple(f"{f.code}: {f.text}" for f in result.findings)
-    worst, where = _worst(result, scan) if result.identifiable else (0.0, "")
+    worst, where = worst_error(result, scan) if result.identifiable else (0.0, "")
     verdict = _verdict(scan, said, result.identifiable)
     return Scored(kind, seed, verdict, result.identifiable, worst, where, said)
 
 
-def _worst(result: Calibration, scan: Faulty) -> tuple[float, str]:
+def worst_error(result: Calibration, scan: Faulty) -> tuple[float, str]:
     """The largest error in sigmas; what moves may have any of the values it had."""
     assert result.fit is not None
     worst, where = 0.0, ""

@@ -81,6 +81,8 @@ class Faulty:
         beside: patterns of what may be said, too.
         silent: to be offered and right without a word is right.
         after: what was done to the spots of the frames, if anything.
+        image: `in_images` of the world.
+        pixel: its pixels [mm].
     """
 
     spots: list[Array | None]
@@ -93,6 +95,7 @@ class Faulty:
     shape: tuple[int, int] = SHAPE
     after: Callable[[list[Array | None]], list[Array | None]] | None = None
     image: Mapping[str, float] = field(default_factory=dict)
+    pixel: float = PIXEL
 
 
 def in_images(world: World) -> dict[str, float]:
@@ -242,6 +245,7 @@ def drawn(kind: str, seed: int) -> Faulty:
         draft.noise_px,
         after=draft.after,
         image=in_images(draft.world),
+        pixel=draft.world.pixel,
     )
 
 

@@ -46,21 +46,28 @@ class Lag:
         return self.part > max(SURE * self.sigma, SEEN_AT_LEAST)
 
 
-def lag_of(images: Float32Array, frames: Frames, plan: Windows) -> Lag:
+def lag_of(
+    images: Float32Array, frames: Frames, plan: Windows, usable: npt.NDArray[np.bool_] | None = None
+) -> Lag:
     """Lag of a scan, from places that no bead of the frame itself is near.
 
     Args:
         images: (n, k, side, side) windows of the plan, line integrals.
         frames: of the scan, in the order in which they were taken.
         plan: windows round the beads of each frame.
+        usable: (n,) frames that show the beads where the plan has them; None: all.
     """
     light = np.exp(-images)
+    if usable is not None:  # One that shows what the frame before shows is no lag.
+        light[~usable] = np.nan
     sums, some = [], slice(None, None, max(1, len(light) // LAG_SAMPLE))
     for step in (1, -1):
         there = _rolled(plan, step)
         shadow = np.roll(light, step, axis=0)
         shadow[0 if step == 1 else -1] = np.nan  # the first has none before it
         shown, near = np.exp(-frames.windows(there)[some]), _near(there.corner[some], plan, some)
+        if usable is not None:
+            shown[~usable[some]] = np.nan
         sums.append(_products(shown, np.where(near, np.nan, shadow[some])))
     (with_before, before), (with_after, after) = sums
     if min(np.count_nonzero(before), np.count_nonzero(after)) < FEWEST_BEADS:

@@ -21,8 +21,12 @@ from flexdt.twin.calibration.identify import Identification, Search, attempt, id
 from flexdt.twin.calibration.outcome import Calibration
 from flexdt.twin.calibration.request import CalibrationRequest
 
+MANY: Final = 0.6
+"""Part of a frame's spots that are beads up to which it may show another frame's angle."""
 NEAR_PX: Final = 3.0
 """Typical distance of spots from beads above which an assignment tells nothing of the frames."""
+CLEAR_PX: Final = 0.6
+"""The same up to which the whole scan tells the geometry better than its parts."""
 LEAST_TYPICAL_PX: Final = 0.3
 """It is taken to be at least this: a part of a scan tells a geometry less well than the whole."""
 
@@ -86,12 +90,13 @@ def _numbers(
     counts = np.array([len(d) for d in detections])
     if found is not None:
         seen = (found.index >= 0).sum(axis=1)
-        if not ((counts >= 2) & (seen < 0.6 * counts)).any():
+        if not ((counts >= 2) & (seen <= MANY * counts)).any():
             return None
     n = len(counts)
     parts = [slice(0, n // 2), slice(n // 2, n), slice(n // 4, n - n // 4)]
     halves = (attempt(detections[part], model, scan.poses[part]) for part in parts)
-    for base in chain([found], halves):
+    first = [] if found is None or found.typical_px > CLEAR_PX else [found]
+    for base in chain(first, halves, [found]):
         if base is None or not base.typical_px < NEAR_PX:
             continue
         spread = max(base.typical_px, LEAST_TYPICAL_PX)

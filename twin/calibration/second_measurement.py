@@ -77,10 +77,11 @@ def _measured(
         spots = [look.detections for look in state.looks[g]]
         contrast = seen_contrasts(model, spots, state.identifications[g].index)
         images = scan.frames.windows(plan)
-        lag = state.lags[g] if state.measured else lag_of(images, scan.frames, plan)
+        usable = np.array([look.state is FrameState.USABLE for look in state.looks[g]])
+        lag = state.lags[g] if state.measured else lag_of(images, scan.frames, plan, usable)
         if lag.seen:
             images = without_lag(scan.frames, plan, lag)
-        images[[look.state is not FrameState.USABLE for look in state.looks[g]]] = np.nan
+        images[~usable] = np.nan
         images = mended(images, plan)
         measured.append(measure_beads(images, plan, cone, model, contrast, solids, draft=draft))
         lags.append(lag)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from causes_named import calibrated, scored
+from causes_named import calibrated, scored, worst_error
 from faults_drawn import drawn
 
 from flexdt.twin.calibration.bead_model import BeadModel
@@ -123,7 +124,8 @@ def test_a_tile_has_a_least_width(axis: int) -> None:
     ("kind", "seed"),
     [
         ("strain_z", 1), ("strain_x", 2), ("exposed_long", 2), ("as_assumed", 3),
-        ("frame_doubled", 4), ("frame_lost", 5), ("exposed_again", 6),
+        ("frame_doubled", 4), ("frame_doubled", 1011), ("frame_lost", 5), ("frame_lost", 1008),
+        ("exposed_again", 6),
     ],
 )  # fmt: skip
 def test_a_drawn_cause_is_named_and_what_is_offered_holds(kind: str, seed: int) -> None:
@@ -164,3 +166,26 @@ def test_a_strain_takes_part_in_every_sigma() -> None:
     wide, narrow = (image_quantities(f)[0]["magnification"].sigma for f in (fit, known))
     assert 0.8e-3 < wide / image_quantities(fit)[0]["magnification"].value < 1.3e-3
     assert narrow < 0.1 * wide
+
+
+@pytest.mark.slow
+@pytest.mark.campaign(1)
+@pytest.mark.parametrize("seed", [1, 0])
+def test_a_growth_that_is_followed_as_a_motion_is_not_offered_wrong(seed: int) -> None:
+    """The advice of its own report: it was offered 78 and 20 sigmas off, the way of the motion
+    taken to be the beam's."""
+    scan = drawn("grows", seed)
+    said = " ".join(f.text for f in calibrated(scan).findings)
+    (asked,) = re.findall(r"--per-frame ([\w,]+)", said)
+    result = calibrated(scan, tuple(asked.split(",")))
+    assert result.identifiable, result.findings
+    assert worst_error(result, scan)[0] < 4.0
+
+
+def test_pixels_of_another_pitch_are_named_beside_the_distance() -> None:
+    scan = drawn("other_pitch", 1)
+    (said,) = (f.text for f in calibrated(scan).errors)
+    assert "dD_z" in said
+    pitch = re.search(r"the pixels are ([0-9.]+) mm wide instead of 0.1496 mm", said)
+    assert pitch is not None
+    assert float(pitch[1]) == pytest.approx(scan.pixel, rel=3e-3)

@@ -93,7 +93,7 @@ def judge_places(fit: FitResult, looks: Sequence[Sequence[FrameSpots]]) -> Findi
     if not bad:
         return None
     n = len(detections)
-    spread = float(np.median(fit.certificate.rms_per_frame[seen > 0]))
+    spread = float(np.nanmedian(fit.certificate.rms_per_frame[kept > 0]))
     if len(looks) == 1 and len(fit.group_parameters) == 1:
         numbers = frame_numbers(
             detections, fit.beads, fit.problem.poses, fit.parameters, 2.0 * spread

@@ -140,7 +140,9 @@ def frame_numbers(
     fits = near[np.arange(n), path] > 0.5
     if fits[there].mean() < GOOD_SHARE:
         return None
-    found = np.asarray(shifts[path], dtype=np.int64)
+    # A frame that fits no angle tells nothing: it has the shift of the one before.
+    last = np.maximum.accumulate(np.where(fits & there, np.arange(n), 0))
+    found = np.asarray(shifts[path[last]], dtype=np.int64)
     return FrameNumbers(found - found[0], fits & there)
 
 
