@@ -33,6 +33,8 @@ OF_RESIDUALS = frozenset(
 """Findings about what a fit leaves: they hold for that fit alone."""
 MISFIT_PX = 0.10
 """Residual of the final fit above which its numbers are not to be used unless explained."""
+AS_GOOD = 1.5
+"""A fit whose residuals are at most so many times as large explains the data as well."""
 BLOCK_SHARE = 0.7
 """Part of the frames of a block, from the first or to the last of a scan, that do not fit."""
 MOST_USED = 0.9
@@ -240,6 +242,8 @@ def explain_residuals(
     plain = fit
     fit, causes = explained_by_causes(fit, known, refit)
     told = named_causes(fit, plain, causes)
+    if "beads" in causes.applied and _one_is_elsewhere(plain, fit):
+        fit, told = plain, []
     certificate = fit.certificate
     out = [*_lost_beads(fit), *_drifts(fit), *told]
     noisy = sigmas_known and certificate.noise < NOISY
@@ -258,6 +262,13 @@ def explain_residuals(
         "dO_x,dO_y,alpha",
     )
     return fit, [*_lost_beads(fit), explained]
+
+
+def _one_is_elsewhere(plain: FitResult, moved: FitResult) -> bool:
+    """Whether beads that a fit left out explain as much as places of all beads that were fitted."""
+    left_out = _lost_beads(plain)
+    enough = bool(left_out) and not any(f.forbids for f in left_out)
+    return enough and plain.certificate.rms_px < AS_GOOD * moved.certificate.rms_px
 
 
 def _drifts(fit: FitResult) -> list[Finding]:
