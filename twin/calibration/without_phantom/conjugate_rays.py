@@ -142,7 +142,9 @@ class Profile:
             if not narrow.any():
                 break
             ratio = np.where(narrow, [abs(one.width) / one.least for one in steps], 0.0)
-            found.append(steps[int(ratio.argmax())])
+            best = steps[int(ratio.argmax())]
+            unsure = _spread(np.array([one.width for one in steps]), rest, narrow)
+            found.append(best._replace(sigma=math.hypot(best.sigma, unsure)))
             sigma = sigma.copy()
             sigma[int(np.abs(rest[int(ratio.argmax())]).argmax())] = math.inf
         return max(found, key=lambda one: abs(one.width) / one.least)
@@ -186,6 +188,21 @@ class Profile:
             middle = (low + high) / 2
             low, high = (low, middle) if explained(middle) else (middle, high)
         return np.hypot(sigma, high)
+
+
+def _spread(widths: FloatArray, rest: FloatArray, usable: npt.NDArray[np.bool_]) -> float:
+    """Give the standard deviation of widths (r,) over radii that explain shifts about as well.
+
+    Args:
+        widths: of steps at the radii, (r,) [px].
+        rest: what each leaves in sigmas, (r, m).
+        usable: whether a radius counts, (r,).
+    """
+    chi_square = np.square(rest).sum(axis=1)
+    less = np.minimum(chi_square[usable].min() - chi_square, 0.0)
+    likely = usable * np.exp(less / 2.0)
+    mean = np.average(widths, weights=likely)
+    return float(np.sqrt(np.average(np.square(widths - mean), weights=likely)))
 
 
 def _basis(

@@ -54,6 +54,8 @@ def find_gap(
         return None
     first = certified[0] if certified else _from_step(step, axis)
     gap = _refined(rays, values, first)
+    if not certified:  # the column is not known to the pixel
+        gap = gap._replace(sigma=max(gap.sigma, first.sigma))
     if not certified and gap.width < SIGMAS * gap.sigma:
         return None
     others = [
