@@ -12,7 +12,8 @@ width and no others, whatever passes there: it is an identity of the panel. What
 distance to distance (beam hardening at walls, a yaw, few views) is no step; how much that is says
 what a step must exceed.
 
-Uncertainties follow from leaving out sectors of the turn.
+Uncertainties follow from leaving out sectors of the turn, those of steps from leaving out rows as
+well: a gap is in all rows, what leans is not.
 """
 
 from __future__ import annotations
@@ -281,7 +282,7 @@ class ConjugateRays:
             _, moved, told, power = self._sums(values)
             if not told.sum() > ALIKE * power.sum():
                 return values, math.inf
-            shift, sigma = _left_out(moved.sum(axis=1), told.sum(axis=1))
+            shift, sigma = _left_out(moved.sum(axis=(1, 2)), told.sum(axis=(1, 2)))
             values[0] -= shift / 2.0 / slope
             if abs(shift) < NEAR * sigma:
                 break
@@ -299,7 +300,7 @@ class ConjugateRays:
         radius, moved, told, power = self._sums(values)
         if len(radius) == 0:
             return None
-        weight = told.sum(axis=0)
+        weight = told.sum(axis=(0, 1))
         place = (radius / max(WIDE * self.smoothing, radius[-1] / BINS)).astype(np.intp)
         count = int(place[-1]) + 1
         of_bin = (place[:, None] == np.arange(count)).astype(np.float64)
@@ -307,7 +308,8 @@ class ConjugateRays:
         good = np.bincount(place, weight) > ALIKE * np.bincount(place, power)
         shift, sigma = np.ones((2, count))
         for i in np.flatnonzero(good).tolist():
-            shift[i], sigma[i] = _left_out(moved[:, i], told[:, i])
+            ways = [_left_out(*(t[..., i].sum(axis=a) for t in (moved, told))) for a in (1, 0)]
+            shift[i], sigma[i] = ways[0][0], max(way[1] for way in ways)
         good &= np.isfinite(sigma)
         if good.sum() < FEWEST_BINS:
             return None
@@ -316,9 +318,9 @@ class ConjugateRays:
         return Profile.of(radius, weight, place, shift[good], sigma[good], self.smoothing)
 
     def _sums(self, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Give distances from the axis (k,); sums over each sector and distance of differences
-        times slopes and of slopes of one end times those of the other, (SECTORS, k) each; the
-        power of slopes (k,)."""
+        """Give distances from the axis (k,); sums over each sector, group of rows and distance of
+        differences times slopes and of slopes of one end times those of the other,
+        (SECTORS, groups, k) each; the power of slopes (k,)."""
         axis = self.scan.column(values, self.row)
         apart_px = max(1.0, self.smoothing / PER_SIGMA)
         radius = np.arange(0.5, min(self.cols - 1 - axis, axis) - 3.0 * self.smoothing, apart_px)
@@ -333,9 +335,9 @@ class ConjugateRays:
             own[:, i], other[:, i] = ((b - a) / (2.0 * little) for a, b in ends)
         for table in (apart, own, other):
             table -= table.mean(axis=0)
-        moved, told = np.zeros((2, SECTORS, len(radius)))
-        np.add.at(moved, self.sector, (apart * (own + other)).sum(axis=1) / 2.0)
-        np.add.at(told, self.sector, (own * other).sum(axis=1))
+        moved, told = np.zeros((2, SECTORS, len(self.rows), len(radius)))
+        np.add.at(moved, self.sector, apart * (own + other) / 2.0)
+        np.add.at(told, self.sector, own * other)
         power = (np.square(own) + np.square(other)).sum(axis=(0, 1)) / 2.0
         return radius, moved, told, power
 
@@ -368,8 +370,8 @@ class ConjugateRays:
 
 
 def _left_out(moved: FloatArray, told: FloatArray) -> tuple[float, float]:
-    """Give a ratio of sums over sectors (SECTORS,), and its sigma from leaving out each; inf where
-    one sector has it all."""
+    """Give a ratio of sums over sectors or rows (n,), and its sigma from leaving out each;
+    inf where one has it all."""
     count = len(told)
     rest = told.sum() - told
     if not (told.sum() > 0.0 and rest.min() > 0.0):
