@@ -97,11 +97,13 @@ def _changes(images: Float32Array) -> Float32Array:
 def _noise_of(images: Float32Array) -> float:
     """Variance of white noise in images, (n, rows, cols).
 
-    From mixed differences of four neighbours, to which an object gives little in most of the views.
+    From differences of neighbouring pixels, and of neighbouring views: of the two that in which an
+    object shows less.
     """
     if images.shape[1] > 1:
         mixed, terms = np.diff(np.diff(images, axis=2), axis=1), 4.0
     else:
         mixed, terms = np.diff(images, n=2, axis=2), 6.0
-    typical = np.median(np.square(mixed), axis=0) / MEDIAN_OF_SQUARES / terms
-    return float(typical.mean())
+    beside = float(np.median(np.square(mixed), axis=0).mean()) / terms
+    between = float(np.median(np.square(np.diff(images, n=2, axis=0)), axis=0).mean()) / 6.0
+    return min(beside, between) / MEDIAN_OF_SQUARES
