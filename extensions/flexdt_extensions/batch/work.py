@@ -401,7 +401,7 @@ def _calibrations(plan: Plan, item: Item) -> tuple[dict[str, Array], dict[str, A
         fit = estimate_geometry(
             noisy, model, item.poses, free, shape=item.shape, noise_px=item.noise_px,
             priors=known(free, plan.calibrate.priors),
-            strain=known_strain(model, free, plan.calibrate.priors),
+            strain=known_strain(model, given=plan.calibrate.priors, free=free),
         )  # fmt: skip
         return {}, _judged(fit, item, free, fit.identifiable, "")
     from flexdt.twin.calibration.pipeline import CalibrationRequest, Scan, calibrate
