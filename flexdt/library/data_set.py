@@ -121,8 +121,8 @@ class DataSet(ImageSet):
             >>> counts, flat = np.full((3, 4, 5), 1000), np.full((4, 5), 1000)
             >>> counts[:, 1:3, 2] = 500
             >>> data = DataSet.from_arrays(counts, scan, flat=flat)
-            >>> data.reconstruct("fdk", voxel=1.0)
-            <Volume: 2 x 3 x 3 voxels (z, y, x) of 1 mm about (0, 0, 0) mm>
+            >>> data.reconstruct("fdk", voxel=0.5)
+            <Volume: 4 x 5 x 5 voxels (z, y, x) of 0.5 mm about (0, 0, 0) mm>
         """
         from flexdt.library.reconstruction.reconstruct import VolumeRequest, reconstruct_volume
 

@@ -337,8 +337,12 @@ def test_a_volume_format_that_is_added_is_at_every_door(
     assert run(["reconstruct", str(folder), "--out", str(tmp_path / "v.none")]) == 2
     assert ".vol.gz" in capsys.readouterr().err
     out = tmp_path / "made.vol.gz"
+    seen = fx.ConeVec.circular(sod=100, sdd=200, angles=3, shape=(8, 9), pixel=1.0)
+    fx.DataSet.from_arrays(np.full((3, 8, 9), 900), seen, flat=np.full((8, 9), 1000)).save(
+        tmp_path / "seen"
+    )
     sirt = ("--shape", "4,4,4", "--algorithm", "sirt", "--iterations", "1")
-    assert run(["reconstruct", str(folder), *sirt, "--out", str(out)]) == 0
+    assert run(["reconstruct", str(tmp_path / "seen"), *sirt, "--out", str(out)]) == 0
     assert fx.Volume.load(out).shape == (4, 4, 4)
     assert all(differs() for differs in VOLUMES)
 
