@@ -41,6 +41,8 @@ TELLING: Final = 0.3
 or few columns beyond the axis has larger ones."""
 FEWEST_VIEWS: Final = 1.6
 """Views for a coarse column, below which streaks hide what does not fit."""
+LEAST: Final = 12
+"""Views and coarse columns below which a volume fits whatever it is made of, and nothing is told."""
 UNEVEN: Final = 2.0
 """Widest over usual angle of a view, above which views are at random and weights are rough."""
 AS_GOOD: Final = 1.05
@@ -97,9 +99,9 @@ def contradiction_of(scan: CoarseScan, values: Float32Array) -> Contradiction | 
         values: of its volume, (nz, ny, nx), 0 where there are none.
 
     Returns:
-        None where they fit, and of helices.
+        None where they fit, of helices, and of scans of too few views or columns to tell.
     """
-    if scan.circle.rise:
+    if scan.circle.rise or min(len(scan.circle.step), scan.images.shape[2]) < LEAST:
         return None
     return _Trial(scan, values).verdict()
 
