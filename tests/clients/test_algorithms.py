@@ -75,7 +75,7 @@ def test_the_library_takes_it(scan: fx.DataSet, monkeypatch: pytest.MonkeyPatch)
     with pytest.raises(fx.TwinError, match="unknown algorithm 'half'"):
         scan.reconstruct("half")
     monkeypatch.setitem(ALGORITHMS, "half", ADDED)
-    assert (scan.reconstruct("half", voxel=1.0, iterations=4).data == 2.0).all()
+    assert (scan.reconstruct("half", voxel=0.5, iterations=4).data == 2.0).all()
     with pytest.raises(fx.TwinError, match="half") as caught:
         scan.reconstruct("art")
     assert "half" in caught.value.data["allowed"]

@@ -77,6 +77,7 @@ def test_rows_far_from_the_plane_of_the_source_are_refused() -> None:
     assert "lean too much" in high.align().alignment.refused["axis_column_px"]
 
 
+@pytest.mark.filterwarnings("ignore:no accuracy is claimed")  # rightly, of the panel aside
 @pytest.mark.parametrize("turn", [360.0, 200.0])
 def test_one_row_from_simulate_over_align_to_a_volume(turn: float) -> None:
     """The axis stands 2.3 px beside its place; the slice is that of the true geometry."""

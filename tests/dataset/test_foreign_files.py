@@ -57,6 +57,7 @@ def test_nikon_scans_come_back_as_they_are(seed: int, tmp_path: Path) -> None:
     np.testing.assert_array_equal(half.counts(3), data.counts(6))
 
 
+@pytest.mark.filterwarnings("ignore:no accuracy is claimed")  # rightly
 @pytest.mark.parametrize("wrong", ["sense", "ObjectOffsetX", "ObjectRoll", "mirrored"])
 @pytest.mark.daily(1)
 def test_the_phantom_would_show_a_wrong_convention(wrong: str, tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from simulation import Simulation
 
 from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.files.own_documents import Changes
+from flexdt.server.storage.job_files import JobFiles
 from flexdt.server.storage.memory import FILE, Memory, StateStore, remember
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
@@ -31,7 +32,7 @@ def test_a_write_that_is_under_way_does_not_undo_the_last(
     ended = threading.Event()
 
     def make(last: bool) -> Memory:
-        return remember(scanner, 0.0, [], 0, [], ended=last)
+        return remember(scanner, 0.0, 0, [], ended=last)
 
     class Late(Memory):
         """Encoded by its thread only after the server has ended."""
@@ -42,7 +43,8 @@ def test_a_write_that_is_under_way_does_not_undo_the_last(
             return super().model_dump_json(by_alias=True)
 
     first = Late.model_construct(**dict(make(False)))
-    keeper = StateStore(Directory(tmp_path), lambda last: make(True) if last else first)
+    root = Directory(tmp_path)
+    keeper = StateStore(root, lambda last: make(True) if last else first, JobFiles(root), dict)
     written: list[str] = []
     keep = Directory.keep
 

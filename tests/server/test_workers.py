@@ -95,6 +95,7 @@ OTHERS: dict[str, Callable[[CheckInput], Any]] = {
     "size": lambda m: SampleSize(30.0, 40.0),
     "pieces": lambda m: (hull(np.eye(4, 3) * 5.0),),
     "parameters": lambda m: Offsets(dD_x=0.5),
+    "physics": lambda m: "poly",
 }
 
 

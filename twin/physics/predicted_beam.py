@@ -87,13 +87,15 @@ def open_beam_of(
 
 
 def proposed_setting(machine: Machine, exposure: ExposureSettings, beam: OpenBeam) -> str:
-    """Name an exposure that fills the panel, or a power where no exposure does.
+    """Name an exposure that fills the panel, or a power where no exposure does, or a voltage.
 
     Args:
         machine: whose limits hold.
         exposure: the setting that `beam` was predicted for.
         beam: its open beam.
     """
+    if beam.counts <= 0.0:
+        return "a higher voltage"
     spec, tube = machine.detector, machine.tube
     factor = BRIGHTEST_FILL / beam.fill
     power_W = exposure.power_W

@@ -82,7 +82,7 @@ def _found(
         yield from spans
         if operation is Operation.ITERATE and not spans:
             yield from arc_findings(geometry)
-    if images is not None:
+    if images is not None and len(images):
         yield from integral_findings(some_of(images))
     if volume is not None:
         yield from volume_findings(volume)

@@ -12,7 +12,7 @@ from flexdt.twin.algorithms import PLAIN
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
-from flexdt.twin.plausibility import Operation, examine, warn_of
+from flexdt.twin.plausibility import Operation, PlausibilityWarning, examine, settled
 from flexdt.twin.projection import Grid, Volume, as_volume
 from flexdt.twin.projection.operators import (
     as_cone_vec,
@@ -92,10 +92,13 @@ def fdk(
 
     shape = values.shape[1], values.shape[2]
     box = as_volume(like).boxes[0]
-    warn_of(examine(Operation.FDK, geometry, shape, images=values, grid=box), GeometryError)
+    found = examine(Operation.FDK, geometry, shape, images=values, grid=box)
+    sentences = settled(found, GeometryError)
     volume, doubts = checked_fdk(
         values.__getitem__, parts, geometry, shape, like, window, progress, errors=errors
     )
+    for sentence in sentences:
+        warnings.warn(sentence, PlausibilityWarning, stacklevel=3)
     for doubt in doubts:
         warnings.warn(doubt, stacklevel=3)
     return volume

@@ -85,6 +85,7 @@ def calibrate(
         option_values.require_ending(report, ".html", ".json")
     from flexdt.library.calibration.calibrate import calibrate_with
     from flexdt.library.calibration.calibration_report import write_report
+    from flexdt.library.calibration.calibration_request import request_of
     from flexdt.library.figures import require_plots
 
     options: CalibrationOptions = {
@@ -107,6 +108,7 @@ def calibrate(
         _require_answer(twin)
     if report is not None and report.suffix.lower() != ".json":
         require_plots()
+    request_of(target, options)  # what cannot be asked for is said before images are read
     given = _given(datasets or [], frames, markers, geometry or [], said(None, shape, pixel))
     outcome = calibrate_with(given, target, options)
     document: dict[str, Any] = outcome.document

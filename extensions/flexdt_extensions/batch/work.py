@@ -20,14 +20,14 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.library.scan_limits import (
+from flexdt.phantoms import Phantom, bead_phantom, load_phantom, material, stated_keV
+from flexdt.phantoms.channels import chain_through, channels, line_integrals
+from flexdt.phantoms.scan_limits import (
     check_distances,
     check_placement,
     check_tube,
     open_beam_doubts,
 )
-from flexdt.phantoms import Phantom, bead_phantom, load_phantom, material, stated_keV
-from flexdt.phantoms.channels import chain_through, channels, line_integrals
 from flexdt.twin.calibration import FitResult, bead_model, estimate_geometry
 from flexdt.twin.calibration.fit.priors import known, known_strain
 from flexdt.twin.errors import TwinError

@@ -15,7 +15,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
-from html import escape
 from itertools import groupby
 from os import PathLike
 from pathlib import Path
@@ -36,7 +35,7 @@ from flexdt.library.calibration.markers import (
 )
 from flexdt.library.calibration.square_pixels import squared
 from flexdt.library.datasets.image_set import Images, Images_co, ImageSet
-from flexdt.library.datasets.notebook_html import values_table
+from flexdt.library.datasets.notebook_html import emphasised, values_table
 from flexdt.phantoms import Phantom, load_phantom
 from flexdt.phantoms.files.phantom_files import read_phantom_file
 from flexdt.twin import long_work
@@ -88,7 +87,7 @@ class Outcome(Generic[Images_co]):
             for name, found in self.parameters.items()
             if found["asked"]
         )
-        return f"<p><b>{escape(self.verdict)}</b></p>{values_table(heads, rows)}"
+        return emphasised(self.verdict) + values_table(heads, rows)
 
     @property
     def verdict(self) -> str:

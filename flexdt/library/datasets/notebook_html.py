@@ -28,6 +28,11 @@ def facts_table(caption: str, facts: Mapping[str, object]) -> str:
     return f"<table><caption>{escape(caption)}</caption>{rows}</table>"
 
 
+def emphasised(text: str) -> str:
+    """Write a sentence as a paragraph in bold; it is escaped."""
+    return f"<p><b>{escape(text)}</b></p>"
+
+
 def values_table(heads: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
     """Write a table with a row of heads; texts are escaped."""
     head = "".join(f"<th>{escape(one)}</th>" for one in heads)

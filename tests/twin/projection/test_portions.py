@@ -27,6 +27,7 @@ TURNED = {
 }
 
 
+@pytest.mark.filterwarnings("ignore:.*of the grid lie beside the field of view")
 @pytest.mark.usefixtures("on_processor")
 @pytest.mark.parametrize("name", TURNED)
 def test_results_do_not_depend_on_portions(name, circle, monkeypatch) -> None:

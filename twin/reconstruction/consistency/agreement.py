@@ -42,7 +42,7 @@ or few columns beyond the axis has larger ones."""
 FEWEST_VIEWS: Final = 1.6
 """Views for a coarse column, below which streaks hide what does not fit."""
 LEAST: Final = 12
-"""Views and coarse columns below which a volume fits whatever it is made of, and nothing is told."""
+"""Views and coarse columns below which a volume fits whatever it is made of: nothing is told."""
 UNEVEN: Final = 2.0
 """Widest over usual angle of a view, above which views are at random and weights are rough."""
 AS_GOOD: Final = 1.05
