@@ -4,11 +4,14 @@ from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_mode
 from flexdt.twin.calibration.detect.detection import Detections, SpotFinder, detect_beads
 from flexdt.twin.calibration.fit.certificate import Certificate, Estimate
 from flexdt.twin.calibration.fit.fit import (
+    IN_IMAGES,
     LEAST_SQUARES,
     FitResult,
     Solver,
+    axis_in_image,
     estimate_geometry,
     fit_geometry,
+    image_slopes,
     require_identifiable,
 )
 from flexdt.twin.calibration.fit.identifiability import Prediction, identifiability, visible_beads
@@ -25,6 +28,7 @@ from flexdt.twin.calibration.identify import Identification, Search, identify_be
 
 __all__ = [
     "EIGHT",
+    "IN_IMAGES",
     "LEAST_SQUARES",
     "SIX",
     "BeadModel",
@@ -41,6 +45,7 @@ __all__ = [
     "Search",
     "Solver",
     "SpotFinder",
+    "axis_in_image",
     "bead_model",
     "build_problem",
     "detect_beads",
@@ -49,6 +54,7 @@ __all__ = [
     "fit_geometry",
     "identifiability",
     "identify_beads",
+    "image_slopes",
     "overlapping",
     "require_identifiable",
     "spot_radii",

@@ -33,7 +33,7 @@ from pydantic import (
 from flexdt.extending import CommandError
 from flexdt.twin.calibration import SIX
 from flexdt.twin.calibration.fit.priors import NOISE_PX, exact
-from flexdt.twin.calibration.request import CalibrationRequest
+from flexdt.twin.calibration.pipeline import CalibrationRequest
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.offsets import NAMES
 from flexdt_extensions.executors import problems_of, read_toml

@@ -6,6 +6,7 @@ A task knows the hidden truth, renders the detector's images and scores what eac
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Mapping
 from typing import Final
 
@@ -165,7 +166,11 @@ class QualityTask:
         geometry = ConeVec.concatenate(self._cones)
         images = np.stack(self.images)
         x = self.volume
-        self.volume = sirt(images, geometry, x, iterations=ITERATIONS, start=x, nonnegative=True)
+        with warnings.catch_warnings():  # the first frames of every episode are a limited arc
+            warnings.filterwarnings("ignore", "the views leave out")
+            self.volume = sirt(
+                images, geometry, x, iterations=ITERATIONS, start=x, nonnegative=True
+            )
         rest = images - forward(self.volume, geometry, lab.small_shape)
         self._residual = float(np.sqrt(np.mean(rest**2) / max(float(np.mean(images**2)), 1e-12)))
         return self.judge()

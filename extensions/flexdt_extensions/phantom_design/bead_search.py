@@ -20,14 +20,15 @@ import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
 
 from flexdt.twin.calibration import (
+    IN_IMAGES,
     BeadModel,
+    axis_in_image,
     estimate_geometry,
     spot_radii,
     tolerance_of,
     visible_beads,
 )
 from flexdt.twin.calibration.detect.detection import Detections
-from flexdt.twin.calibration.fit.fit import IN_IMAGES, axis_in_image
 from flexdt.twin.calibration.identify import Search, identify, overlapping
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray

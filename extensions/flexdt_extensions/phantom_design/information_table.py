@@ -26,11 +26,11 @@ from flexdt.twin.calibration import (
     BeadModel,
     build_problem,
     edge_factor,
+    image_slopes,
     spot_radii,
     tolerance_of,
     visible_beads,
 )
-from flexdt.twin.calibration.fit.fit import image_slopes
 from flexdt.twin.calibration.fit.priors import NOISE_PX, known
 from flexdt.twin.calibration.fit.problem import FitProblem
 from flexdt.twin.geometry.conventions import FloatArray

@@ -25,8 +25,7 @@ from flexdt.library.figures import COLOURS, DPI, blank, require_plots, svg
 from flexdt.library.report_page import bullets, heading, page, paragraph, table
 from flexdt.phantoms import Phantom, cuboid_with_beads, spiral_positions
 from flexdt.phantoms.bricks import Brickwork, lego_phantom
-from flexdt.twin.calibration import BeadModel
-from flexdt.twin.calibration.fit.fit import IN_IMAGES
+from flexdt.twin.calibration import IN_IMAGES, BeadModel
 from flexdt.twin.calibration.fit.weak_directions import BOUND, TOLERANCE, unit_of
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.camera import CameraSettings
