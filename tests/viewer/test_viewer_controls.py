@@ -356,6 +356,38 @@ def test_upload_of_a_mesh(
     assert middle.max() > 0.1
     page.locator(".note.good", has_text=shown).wait_for()  # the page has done all that it does
     page.evaluate("flexdt.call('sample.set', {name: 'lego'})")
+    page.select_option("#sample", "lego")
+    assert page.is_hidden("#sample-delete"), "what ships stays"
+    page.select_option("#sample", shown)
+    page.click("#sample-delete")
+    wait(lambda: shown not in {sample.name for sample in twin.samples().samples}, "deleted")
+    page.locator("#sample-delete").wait_for(state="hidden")
+
+
+def test_an_ended_scan_and_a_correction_are_taken_off_their_lists(
+    page: Any, twin: TwinClient, wait: Wait
+) -> None:
+    def call(method: str, params: dict[str, Any]) -> Any:
+        return page.evaluate("([m, p]) => flexdt.call(m, p)", [method, params])
+
+    poses = [{"rot_obj": 1.0}]
+    scan = {"poses": poses, "exposure_ms": 50.0, "name": f"short-{twin.ping():.6f}"}
+    job = call("trajectory.submit", scan)["job"]
+    wait(lambda: twin.job_status(job).state == "done", "the scan")
+    page.locator("#job-forget").wait_for()
+    page.click("#job-forget")
+    wait(lambda: job not in {one.job for one in twin.jobs().jobs}, "forgotten")
+    page.locator("#job-card").wait_for(state="hidden")
+    old, _ = (
+        call("calibration.apply", {"parameters": {"dO_x": x}})["correction"]["name"]
+        for x in (0.1, 0.2)
+    )
+    tab(page, "calibrate")
+    row = page.locator("#corrections > div", has_text=old)
+    row.get_by_role("button", name="delete").click()
+    wait(lambda: old not in {c.name for c in twin.calibrations().corrections}, "deleted")
+    while twin.calibrations().current is not None:
+        call("calibration.revert", {})
 
 
 def test_names_of_uploads_keep_letters_and_overwrite_nothing(page: Any) -> None:

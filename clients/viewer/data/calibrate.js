@@ -43,6 +43,12 @@ export async function apply(parameters, source, comment = "") {
     emit("note", "good", "Correction", `${answer.correction?.name ?? "correction"} is in force`); // warnings come by the log
     void refresh();
 }
+async function remove(name) {
+    if (!(await command("calibration.delete", { name }, `${name} stays`)))
+        return;
+    emit("note", "good", "Correction", `${name} is deleted`);
+    void refresh();
+}
 async function revert() {
     const answer = await command("calibration.revert", {}, "Not undone");
     if (!answer)
@@ -61,7 +67,9 @@ export async function refresh() {
         box.append(el("div", { class: "muted" }, "none yet"));
     for (const c of [...answer.corrections].reverse()) {
         const again = () => apply(c.parameters, c.source, `again: ${c.name}`);
-        box.append(el("div", {}, el("span", { title: c.comment }, c.name), el("span", { class: "muted small-text" }, dated(c)), c.name === answer.current ? el("b", {}, "in force") : el("button", { class: "small", onclick: again }, "apply")));
+        box.append(el("div", {}, el("span", { title: c.comment }, c.name), el("span", { class: "muted small-text" }, dated(c)), ...(c.name === answer.current ? [el("b", {}, "in force")] : [
+            el("button", { class: "small", onclick: again }, "apply"), el("button", { class: "small", onclick: () => remove(c.name) }, "delete")
+        ])));
     }
 }
 const dated = (correction) => correction.date.slice(0, 16).replace("T", " ");

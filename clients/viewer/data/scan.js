@@ -13,6 +13,7 @@ designer.place($("#tab-scan .card"));
 clicks({
     "script-open": () => $input("#script-file").click(), "check": checkAndPlan, "plan": showPlan, run,
     "compose": () => compose(), "unscrub": () => scrub(null), "job-scrub": recall,
+    "job-forget": forgetJob,
     "job-data": () => { emit("show-tab", "data"); void openData(folder(store.job), null, true); },
 });
 for (const action of ["pause", "resume", "step", "abort"])
@@ -321,7 +322,8 @@ function showJob(job) {
     $button("#job-pause").disabled = job.state !== "running";
     $button("#job-resume").disabled = $button("#job-step").disabled = job.state !== "paused";
     $button("#job-abort").disabled = over;
-    $button("#job-scrub").hidden = $button("#job-data").hidden = !over;
+    for (const id of ["#job-scrub", "#job-data", "#job-forget"])
+        $button(id).hidden = !over;
     if (fresh || plan)
         redraw();
 }
@@ -361,6 +363,13 @@ async function catchUp() {
         return;
     }
     store.job = null; // a twin that knows nothing of it
+    $("#job-card").hidden = true;
+}
+async function forgetJob() {
+    const job = store.job?.job;
+    if (job === undefined || !(await command("job.forget", { job }, "The job stays")))
+        return;
+    store.job = null;
     $("#job-card").hidden = true;
 }
 // The last frame's image may come a little after the scan's end, by our clock, or be of a little after it, by the twin's.

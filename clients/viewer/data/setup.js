@@ -18,7 +18,7 @@ for (const box of $$("[data-layer]"))
 const opacity = $input("#opacity");
 opacity.addEventListener("change", () => void reveal({ opacity: Number(opacity.value) }));
 clicks({
-    "tube-apply": setTube, "camera-apply": setCamera, "sample-apply": setSample, predict, "mesh-upload": sendMesh,
+    "tube-apply": setTube, "camera-apply": setCamera, "sample-apply": setSample, "sample-delete": deleteSample, predict, "mesh-upload": sendMesh,
     "beam": () => command("tube.set", { on: !store.state?.tube.on }, "The tube refuses"),
 });
 // A field or a list of these.
@@ -149,6 +149,18 @@ export async function sendMesh() {
 const formatOf = (file) => (file.name.split(".").pop() ?? "").toLowerCase();
 $input("#mesh-file").addEventListener("change", () => { const file = $input("#mesh-file").files?.[0]; if (file)
     $select("#mesh-unit").value = formatOf(file) === "glb" ? "m" : "mm"; });
+// Uploads that can be deleted: the twin says why one that is in use stays.
+let uploads = [];
+const deletable = () => { $button("#sample-delete").hidden = !uploads.includes($select("#sample").value); };
+$select("#sample").addEventListener("change", deletable);
+async function deleteSample() {
+    const name = $select("#sample").value;
+    if (!(await command("sample.delete", { name }, `${name} stays`)))
+        return;
+    emit("note", "good", "Sample", `${name} is deleted`);
+    takeBack("sample");
+    await list();
+}
 export async function list() {
     const answer = await call("sample.list").catch(() => null);
     if (!answer)
@@ -160,6 +172,8 @@ export async function list() {
     if (![...select.options].some((o) => o.value === chosen))
         select.append(el("option", { value: chosen }, chosen));
     select.value = chosen;
+    uploads = answer.samples.filter((s) => s.uploaded).map((s) => s.name);
+    deletable();
     const materials = $select("#mesh-material");
     if (materials.options.length !== answer.materials.length) {
         materials.replaceChildren(...answer.materials.map((m) => el("option", {}, m)));

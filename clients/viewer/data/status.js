@@ -54,6 +54,8 @@ function warnings(s) {
     const list = [];
     if (isDown(s))
         list.push(["bad", stopped(s)]);
+    if (s.unsaved)
+        list.push(["bad", `Not saved: ${s.unsaved}. A server that is killed now comes back without the last change`]);
     for (const w of s.safety.warnings)
         list.push(["", w]);
     if (store.near?.close)

@@ -44,6 +44,11 @@ export async function apply(parameters: Record<string, number>, source: string |
   emit("note", "good", "Correction", `${answer.correction?.name ?? "correction"} is in force`); // warnings come by the log
   void refresh();
 }
+async function remove(name: string) {
+  if (!(await command("calibration.delete", { name }, `${name} stays`))) return;
+  emit("note", "good", "Correction", `${name} is deleted`);
+  void refresh();
+}
 async function revert() {
   const answer = await command("calibration.revert", {}, "Not undone");
   if (!answer) return;
@@ -62,7 +67,8 @@ export async function refresh(): Promise<void> {
     const again = () => apply(c.parameters, c.source, `again: ${c.name}`);
     box.append(el("div", {},
       el("span", { title: c.comment }, c.name), el("span", { class: "muted small-text" }, dated(c)),
-      c.name === answer.current ? el("b", {}, "in force") : el("button", { class: "small", onclick: again }, "apply")));
+      ...(c.name === answer.current ? [el("b", {}, "in force")] : [
+        el("button", { class: "small", onclick: again }, "apply"), el("button", { class: "small", onclick: () => remove(c.name) }, "delete")])));
   }
 }
 const dated = (correction: Correction) => correction.date.slice(0, 16).replace("T", " ");

@@ -16,6 +16,7 @@ designer.place($("#tab-scan .card"));
 clicks({
   "script-open": () => $input("#script-file").click(), "check": checkAndPlan, "plan": showPlan, run,
   "compose": () => compose(), "unscrub": () => scrub(null), "job-scrub": recall,
+  "job-forget": forgetJob,
   "job-data": () => { emit("show-tab", "data"); void openData(folder(store.job), null, true); },
 });
 for (const action of ["pause", "resume", "step", "abort"] as const) clicks({ [`job-${action}`]: () => command(`job.${action}`, { job: store.job?.job }, `Cannot ${action}`) });
@@ -261,7 +262,8 @@ function showJob(job: JobStatus) {
   $("#job-what").textContent = job.error ? told(job) : over ? job.dataset ?? "" : `${line}${job.what}`;
   $button("#job-pause").disabled = job.state !== "running";
   $button("#job-resume").disabled = $button("#job-step").disabled = job.state !== "paused";
-  $button("#job-abort").disabled = over; $button("#job-scrub").hidden = $button("#job-data").hidden = !over;
+  $button("#job-abort").disabled = over;
+  for (const id of ["#job-scrub", "#job-data", "#job-forget"]) $button(id).hidden = !over;
   if (fresh || plan) redraw();
 }
 const told = (job: JobStatus) => (typeof job.error?.message === "string" ? job.error.message : "");
@@ -292,6 +294,13 @@ async function catchUp() {
   if (store.job?.job !== job || status === undefined) return;
   if (status) { showJob(status); return; }
   store.job = null; // a twin that knows nothing of it
+  $("#job-card").hidden = true;
+}
+
+async function forgetJob() {
+  const job = store.job?.job;
+  if (job === undefined || !(await command("job.forget", { job }, "The job stays"))) return;
+  store.job = null;
   $("#job-card").hidden = true;
 }
 

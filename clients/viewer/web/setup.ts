@@ -18,7 +18,7 @@ for (const box of $$<HTMLInputElement>("[data-layer]")) box.addEventListener("ch
 const opacity = $input("#opacity");
 opacity.addEventListener("change", () => void reveal({ opacity: Number(opacity.value) }));
 clicks({
-  "tube-apply": setTube, "camera-apply": setCamera, "sample-apply": setSample, predict, "mesh-upload": sendMesh,
+  "tube-apply": setTube, "camera-apply": setCamera, "sample-apply": setSample, "sample-delete": deleteSample, predict, "mesh-upload": sendMesh,
   "beam": () => command("tube.set", { on: !store.state?.tube.on }, "The tube refuses"),
 });
 
@@ -116,6 +116,18 @@ export async function sendMesh(): Promise<void> {
 const formatOf = (file: File) => (file.name.split(".").pop() ?? "").toLowerCase();
 $input("#mesh-file").addEventListener("change", () => { const file = $input("#mesh-file").files?.[0]; if (file) $select("#mesh-unit").value = formatOf(file) === "glb" ? "m" : "mm"; });
 
+// Uploads that can be deleted: the twin says why one that is in use stays.
+let uploads: string[] = [];
+const deletable = () => { $button("#sample-delete").hidden = !uploads.includes($select("#sample").value); };
+$select("#sample").addEventListener("change", deletable);
+async function deleteSample() {
+  const name = $select("#sample").value;
+  if (!(await command("sample.delete", { name }, `${name} stays`))) return;
+  emit("note", "good", "Sample", `${name} is deleted`);
+  takeBack("sample");
+  await list();
+}
+
 export async function list(): Promise<void> {
   const answer = await call("sample.list").catch(() => null);
   if (!answer) return;
@@ -124,6 +136,8 @@ export async function list(): Promise<void> {
   for (const s of answer.samples) select.append(el("option", { value: s.name, title: s.description }, s.uploaded ? `${s.name} (uploaded)` : s.name));
   if (![...select.options].some((o) => o.value === chosen)) select.append(el("option", { value: chosen }, chosen));
   select.value = chosen;
+  uploads = answer.samples.filter((s) => s.uploaded).map((s) => s.name);
+  deletable();
   const materials = $select("#mesh-material");
   if (materials.options.length !== answer.materials.length) {
     materials.replaceChildren(...answer.materials.map((m) => el("option", {}, m)));

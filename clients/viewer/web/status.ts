@@ -54,6 +54,7 @@ let parked: Set<string> | null = null;
 function warnings(s: State) {
   const list: Array<[kind: string, words: string]> = [];
   if (isDown(s)) list.push(["bad", stopped(s)]);
+  if (s.unsaved) list.push(["bad", `Not saved: ${s.unsaved}. A server that is killed now comes back without the last change`]);
   for (const w of s.safety.warnings) list.push(["", w]);
   if (store.near?.close) list.push([(store.near.mm ?? 0) < 2 ? "bad" : "", `${store.near.pair.join(" and ")} are ${fixed(store.near.mm, 1)} mm apart`]);
   const there = Object.entries(s.axes).filter(([, a]) => !a.moving && !a.virtual && (Math.abs(a.position - a.limits[0]) < 0.05 || Math.abs(a.limits[1] - a.position) < 0.05)).map(([n]) => n);

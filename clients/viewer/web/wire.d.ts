@@ -14,6 +14,7 @@ export type CalibrationAlignResult = {
   identifiable: boolean; parameters: Record<string, Estimated>; refused: Record<string, string>;
   warnings: Array<string>; correction: Record<string, number> | null; motion: Array<Record<string, JsonValue>> | null
 };
+export type CalibrationDelete = { name: string };
 export type CalibrationFit = {
   datasets: Array<string>; phantom: string; free?: Array<string> | null; steps?: number; tracks?: boolean;
   markers?: Array<Mark> | null; scale?: string | null
@@ -56,6 +57,7 @@ export type Correct = {
 export type Correction = {
   name: string; date: string; parameters: Record<string, number>; comment: string; source: string | null
 };
+export type CorrectionDeleted = { name: string };
 export type CorrectionListResult = { corrections: Array<Correction>; current: string | null };
 export type CorrectionPart = {
   name: string; date: string; parameters: Record<string, number>; comment?: string
@@ -148,6 +150,8 @@ export type SafetyState = {
   state: string; estop: boolean; message: string; stop: number; stopped_by: string | null; clearance_mm: number | null;
   pair: Array<string> | null; warnings: Array<string>
 };
+export type SampleDelete = { name: string };
+export type SampleDeleteResult = { name: string; bytes: number };
 export type SampleInfo = {
   name: string; kind: "phantom" | "mesh" | "voxels" | "scene"; description: string;
   size_mm: [number, number, number] | null; uploaded: boolean
@@ -184,12 +188,12 @@ export type Spectrum = { kV: number };
 export type State = {
   time: number; axes: Record<string, AxisState>; tube: TubeState; camera: CameraState; sample: SampleState;
   geometry: GeometryState; safety: SafetyState; job: JobStatus | null; correction: Correction | null; clock: ClockState;
-  controller: string | null; image: ImageFlags | null
+  controller: string | null; image: ImageFlags | null; unsaved: string | null
 };
 export type Stopped = {
   time: number; axes: Record<string, AxisState>; tube: TubeState; camera: CameraState; sample: SampleState;
   geometry: GeometryState; safety: SafetyState; job: JobStatus | null; correction: Correction | null; clock: ClockState;
-  controller: string | null; image: ImageFlags | null
+  controller: string | null; image: ImageFlags | null; unsaved: string | null
 };
 export type SubmitResult = { job: string; dataset: string | null; warnings: Array<string> };
 export type Theme = { dark?: boolean; fine?: boolean };
@@ -220,6 +224,7 @@ export interface Methods {
   "sample.set": [SampleSet, SampleResult];
   "sample.list": [Empty, SampleListResult];
   "sample.upload": [SampleUpload, UploadResult];
+  "sample.delete": [SampleDelete, SampleDeleteResult];
   "exposure.predict": [ExposurePredict, ExposurePrediction];
   "script.check": [ScriptInput, CheckResult];
   "script.submit": [ScriptInput, SubmitResult];
@@ -234,6 +239,7 @@ export interface Methods {
   "calibration.apply": [Correct, CorrectionResult];
   "calibration.list": [Empty, CorrectionListResult];
   "calibration.revert": [Empty, CorrectionResult];
+  "calibration.delete": [CalibrationDelete, CorrectionDeleted];
   "calibration.fit": [CalibrationFit, CalibrationFitResult];
   "calibration.align": [CalibrationAlign, CalibrationAlignResult];
   "scene.save": [SceneSave, SceneResult];
