@@ -138,6 +138,7 @@ def test_a_shipped_machine_goes_through_the_chain_at_its_own_defaults(
     assert through_the_chain(builtin_machine(name), tmp_path) == "right"
 
 
+@pytest.mark.slow
 @pytest.mark.campaign(2)
 @pytest.mark.parametrize("seed", range(36))
 def test_a_drawn_machine_goes_through_the_chain_or_is_refused(seed: int, tmp_path: Path) -> None:
