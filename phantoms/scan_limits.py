@@ -13,12 +13,7 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine, profile_of
 from flexdt.twin.physics.exposure import ExposureSettings
-from flexdt.twin.physics.predicted_beam import (
-    BRIGHTEST_FILL,
-    Physics,
-    open_beam_of,
-    proposed_setting,
-)
+from flexdt.twin.physics.predicted_beam import Physics, open_beam_doubt, open_beam_of
 from flexdt.twin.plausibility import Severity, settled
 from flexdt.twin.plausibility.examination import Operation, examine
 from flexdt.twin.scanner.state import TubeSettings, changed_tube
@@ -102,8 +97,5 @@ def open_beam_doubts(
         At most one sentence, with an exposure that would do.
     """
     beam = open_beam_of(machine, camera, exposure, view, physics)
-    if beam is None or not (beam.saturated or beam.starved):
-        return []
-    what = f"the open beam fills {beam.fill:.3g} of the panel's range"
-    proposal = proposed_setting(machine, exposure, beam)
-    return [f"{what}; {proposal} would fill {100 * BRIGHTEST_FILL:.0f} %"]
+    doubt = None if beam is None else open_beam_doubt(machine, exposure, beam)
+    return [] if doubt is None else [doubt]

@@ -86,6 +86,24 @@ def open_beam_of(
     return OpenBeam(reading.signal, saturating_counts(panel))
 
 
+def open_beam_doubt(machine: Machine, exposure: ExposureSettings, beam: OpenBeam) -> str | None:
+    """Say that an open beam saturates or starves the panel, and what would do; None if neither.
+
+    Args:
+        machine: whose limits hold for the proposal.
+        exposure: the setting that `beam` was predicted for.
+        beam: its open beam.
+    """
+    if not (beam.saturated or beam.starved):
+        return None
+    what = f"the open beam has {beam.counts:.3g} counts above dark"
+    if beam.saturated:
+        fill = f"{beam.fill:.3g} times the largest count"
+        what = f"the open beam saturates the panel: {fill}"
+    proposal = proposed_setting(machine, exposure, beam)
+    return f"{what}; {proposal} would fill {100 * BRIGHTEST_FILL:.0f} %"
+
+
 def proposed_setting(machine: Machine, exposure: ExposureSettings, beam: OpenBeam) -> str:
     """Name an exposure that fills the panel, or a power where no exposure does, or a voltage.
 

@@ -13,11 +13,10 @@ from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.physics.exposure import ExposureSettings
 from flexdt.twin.physics.predicted_beam import (
-    BRIGHTEST_FILL,
     OpenBeam,
     Physics,
+    open_beam_doubt,
     open_beam_of,
-    proposed_setting,
 )
 from flexdt.twin.script.commands import ImageKind
 from flexdt.twin.script.planning.plan import ScanPlan
@@ -43,18 +42,12 @@ def open_beam_problems(plan: ScanPlan, physics: Physics = "poly") -> tuple[Scrip
     problems: list[ScriptProblem] = []
     for (exposure, camera), (line, indices) in lit_settings(plan).items():
         beam = _brightest(plan, exposure, camera, indices, physics)
-        if beam is None or not (beam.saturated or beam.starved):
+        if beam is None:
             continue
-        proposal = proposed_setting(plan.machine, exposure, beam)
-        remedy = f"{proposal} would fill {100 * BRIGHTEST_FILL:.0f} %"
-        if beam.saturated:
-            code = OPEN_BEAM_CODES[0]
-            fill = f"{beam.fill:.3g} times the largest count"
-            text = f"the open beam saturates the panel: {fill}; {remedy}"
-        else:
-            code = OPEN_BEAM_CODES[1]
-            text = f"the open beam has {beam.counts:.3g} counts above dark; {remedy}"
-        problems.append(ScriptProblem("warning", code, line, 1, text))
+        doubt = open_beam_doubt(plan.machine, exposure, beam)
+        if doubt is not None:
+            code = OPEN_BEAM_CODES[0 if beam.saturated else 1]
+            problems.append(ScriptProblem("warning", code, line, 1, doubt))
     return tuple(problems)
 
 
