@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bead_scan import bead_scan_on
+from bead_scan import bead_in_volume, bead_scan_on
 
 from flexdt.clients.launch.processes import LocalTwin
 from flexdt.library.calibration.calibrate import calibrate_datasets
@@ -158,15 +158,10 @@ def test_a_machine_scans_calibrates_and_reconstructs(name: str, tmp_path: Path) 
     request = VolumeRequest(voxel_mm=0.25, shape=(220, 120, 120))
     reconstruct_dataset(data, tmp_path / "v.tif", request, parameters=correction)
     volume = read_volume(tmp_path / "v.tif")
-    low = np.array(volume.center_mm) - (np.array(volume.shape[::-1]) - 1) / 2 * 0.25
     for bead in BEADS:
-        x, y, z = (slice(a - 4, a + 5) for a in np.rint((bead - low) / 0.25).astype(int))
-        part = np.asarray(volume.data[z, y, x], dtype=float)
-        weight = np.clip(part - 0.4 * part.max(), 0, None)
-        at = np.array([(g * weight).sum() / weight.sum() for g in np.mgrid[-4:5, -4:5, -4:5]])
-        corner = np.rint((bead - low) / 0.25) * 0.25 + low
-        assert np.linalg.norm(corner + 0.25 * at[::-1] - bead) < 0.1
-    assert part.max() > 3 * float(np.median(volume.data))
+        place, brightest = bead_in_volume(volume, bead, reach=4)
+        assert np.linalg.norm(place - bead) < 0.1
+    assert brightest > 3 * float(np.median(volume.data))
 
 
 @pytest.mark.parametrize(("name", "turning"), [("xyzr_cabinet", "R"), ("micro_ct", "R")])

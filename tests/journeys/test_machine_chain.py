@@ -27,7 +27,7 @@ from flexdt.twin.script import check_script
 from flexdt.twin.script.compose import compose_script
 from flexdt.twin.script.planning.open_beam_findings import OPEN_BEAM_CODES
 from flexdt.twin.script.scan_request import ScanRequest
-from tests.support.bead_scan import bead_scan_on
+from tests.support.bead_scan import bead_in_volume, bead_scan_on
 
 SHIPPED = ("flexray", "micro_ct", "unitom_xl", "xyzr_cabinet")
 TRUTH = {"dO_x": 0.35, "dD_x": -0.4, "dD_z": 0.3}
@@ -119,15 +119,10 @@ def assert_beads_in_volume(outcome: Outcome, root: Path) -> None:
     request = VolumeRequest(voxel_mm=0.5, shape=(110, 60, 60))
     reconstruct_dataset(outcome.datasets[0], root / "v.tif", request, parameters=correction)
     volume = read_volume(root / "v.tif")
-    low = np.array(volume.center_mm) - (np.array(volume.shape[::-1]) - 1) / 2 * 0.5
     for bead in np.asarray(load_phantom("lego").beads):
-        x, y, z = (slice(a - 3, a + 4) for a in np.rint((bead - low) / 0.5).astype(int))
-        part = np.asarray(volume.data[z, y, x], dtype=float)
-        weight = np.clip(part - 0.4 * part.max(), 0.0, None)
-        at = np.array([(g * weight).sum() / weight.sum() for g in np.mgrid[-3:4, -3:4, -3:4]])
-        corner = np.rint((bead - low) / 0.5) * 0.5 + low
-        assert np.linalg.norm(corner + 0.5 * at[::-1] - bead) < 0.25
-        assert part.max() > 3.0 * float(np.nanmedian(volume.data))
+        place, brightest = bead_in_volume(volume, bead, reach=3)
+        assert np.linalg.norm(place - bead) < 0.25
+        assert brightest > 3.0 * float(np.nanmedian(volume.data))
 
 
 @pytest.mark.slow

@@ -7,6 +7,9 @@ from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
+
 from flexdt.runtime.files.directory import open_data
 from flexdt.server.imaging.projections import Imaging, TrueGeometry
 from flexdt.server.imaging.radiography import Radiography
@@ -18,10 +21,13 @@ from flexdt.twin.dataset.flexdt_json import NoiseRecord, SampleRecord, ScanRecor
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import Machine, builtin_machine, profile_of
 from flexdt.twin.physics.predicted_beam import Physics
+from flexdt.twin.projection import Volume
 from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script import ScanPlan, parse_script, plan_script
 from flexdt.twin.script.compose import compose_script
 from flexdt.twin.script.scan_request import ScanRequest
+
+Floats = npt.NDArray[np.float64]
 
 
 def bead_scan(root: Path, truth: Mapping[str, float], frames: int) -> Path:
@@ -62,3 +68,22 @@ def bead_scan_on(
         asyncio.run(acquisition.produce([exposure]))
     writer.finish()
     return root / "lego", plan
+
+
+def bead_in_volume(volume: Volume, bead: Floats, reach: int) -> tuple[Floats, float]:
+    """Find a bead near where it belongs: its centre of gravity [mm], and its largest value.
+
+    Args:
+        volume: of cubic voxels.
+        bead: where it belongs, (3,) [mm].
+        reach: voxels to each side of that place that are looked at.
+    """
+    voxel_mm = volume.voxel_xyz[0]
+    low = np.array(volume.center_mm) - (np.array(volume.shape[::-1]) - 1) / 2 * voxel_mm
+    nearest = np.rint((bead - low) / voxel_mm).astype(int)
+    x, y, z = (slice(a - reach, a + reach + 1) for a in nearest)
+    part = np.asarray(volume.data[z, y, x], dtype=float)
+    weight = np.clip(part - 0.4 * part.max(), 0.0, None)
+    span = slice(-reach, reach + 1)
+    at = np.array([(g * weight).sum() / weight.sum() for g in np.mgrid[span, span, span]])
+    return low + voxel_mm * (nearest + at[::-1]), float(part.max())
