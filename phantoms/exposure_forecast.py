@@ -24,12 +24,11 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import Machine, Profile, builtin_machine, profile_of
-from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.physics.chain import Chain, flux_of, radiographs
 from flexdt.twin.physics.detector import detector_of
-from flexdt.twin.physics.exposure import FEW_COUNTS, NOTICED, ExposureSettings
+from flexdt.twin.physics.exposure import FEW_COUNTS, ExposureSettings
 from flexdt.twin.physics.image_quality import air_kerma_mGy, contrast_to_noise, pixel_reading
-from flexdt.twin.physics.predicted_beam import BRIGHTEST_FILL
+from flexdt.twin.physics.predicted_beam import BRIGHTEST_FILL, CountShares
 from flexdt.twin.physics.readout import expected_counts, saturating_counts
 from flexdt.twin.physics.tube import Filter, tube_of, voltages
 from flexdt.twin.projection import project_body
@@ -37,16 +36,22 @@ from flexdt.twin.projection.analytic_solids import Vector
 from flexdt.twin.scanner.state import CameraChange, changed_camera
 from flexdt.twin.script.compose import compose_script
 from flexdt.twin.script.planning.beam_view import views
-from flexdt.twin.script.planning.open_beam_findings import lit_settings, open_beam_problems
+from flexdt.twin.script.planning.open_beam_findings import open_beam_problems
 from flexdt.twin.script.planning.plan import ScanPlan
 from flexdt.twin.script.planning.plan_values import StartState
 from flexdt.twin.script.planning.planner import plan_script
+from flexdt.twin.script.planning.sample_findings import (
+    SampleProbe,
+    sample_probes,
+    sample_problems,
+    shares_behind,
+)
 from flexdt.twin.script.problems import ScriptProblem
 from flexdt.twin.script.scan_request import Kind, ScanRequest
 from flexdt.twin.signatures import public
 
 VIEWS: Final = 8
-"""Views of a turn that are looked at."""
+"""Views of a turn that a forecast looks at."""
 EDGES: Final = np.concatenate([[0.0], np.logspace(-3.95, 0.05, 41), [np.inf]])
 """Bins of transmission: ten a decade, the open beam amid the last, and what lies outside."""
 FILTERS: Final = (
@@ -54,9 +59,6 @@ FILTERS: Final = (
     "copper:1",
 )  # fmt: skip
 """Proposed filters, beside what the tube has."""
-FEW_VIEWS: Final = 3
-"""Views of each setting of a plan that are looked at, of at most `SETTINGS`."""
-SETTINGS: Final = 4
 VOID: Final = "void"
 
 
@@ -403,26 +405,27 @@ class _SeenDetail:
 
 
 def exposure_problems(plan: ScanPlan, phantom: Phantom) -> tuple[ScriptProblem, ...]:
-    """Warnings: the projections of a plan whose pixels will be saturated or starved.
+    """Warn of projections of a plan whose pixels will be saturated or starved.
 
-    A few views of each setting of tube and camera are made without noise.
+    Args:
+        plan: of the scan.
+        phantom: on the stage, about the axis.
     """
     parts, scanner = channels(phantom), plan.machine
     chain = chain_through(parts, detector_of(scanner.detector), tube_of(scanner.tube))
-    known = {(p.code, p.line) for p in open_beam_problems(plan)}
-    problems: list[ScriptProblem] = []
-    settings = lit_settings(plan, kinds=("projection",))
-    for (lit, camera), (line, numbers) in list(settings.items())[:SETTINGS]:
-        some = np.unique(np.linspace(0, len(numbers) - 1, FEW_VIEWS).astype(int))
-        index = [numbers[i] for i in some]
-        positions = {name: x[index] for name, x in plan.image_positions.items()}
-        cone = motor_poses(scanner, plan.profile, camera, positions).cone_vec()
-        _, _, *shares = _views(parts, chain, camera, cone, lit)
-        for name, share in zip(("saturated", "starved"), shares, strict=True):
-            if share >= NOTICED and (f"{name}_open_beam", line) not in known:
-                text = f"about {100 * share:.3g} % of the projections' pixels will be {name}"
-                problems.append(ScriptProblem("warning", f"{name}_pixels", line, 1, text))
-    return tuple(problems)
+    probes = sample_probes(plan)
+    shares = [_shares(parts, chain, probe) for probe in probes]
+    return sample_problems(probes, shares, open_beam_problems(plan))
+
+
+def _shares(parts: Sequence[Channel], chain: Chain, probe: SampleProbe) -> CountShares:
+    """Project the sample along the rays of a probe, and count the pixels."""
+    cone = probe.cone_vec
+    shape = cone.of_shape(None)
+    paths = np.zeros((len(parts), len(cone), *shape), np.float32)
+    for i, part in enumerate(parts):
+        paths[i] = project_body(part.body, cone, shape)
+    return shares_behind(chain, probe, paths, cone.rows)
 
 
 def _views(

@@ -256,16 +256,49 @@ class Imaging:
 
     async def ray(self, sample: Sample, cone: ConeVec) -> dict[str, float]:
         """Material -> path [mm] to the one pixel of `cone`, n = 1, in the object's frame."""
+        found, paths = await self.nominal_paths(sample, cone.with_shape((1, 1)))
+        lengths = paths.sum(axis=(1, 2, 3)).tolist()
+        return {part.material.name: x for part, x in zip(found, lengths, strict=True)}
+
+    async def nominal_paths(
+        self, sample: Sample, cone: ConeVec
+    ) -> tuple[tuple[Channel, ...], Float32Array]:
+        """Paths through each material along rays that nothing hidden moves.
+
+        Args:
+            sample: on the stage, or that a scan is to show.
+            cone: n views with the detector's shape, in the object's frame.
+
+        Returns:
+            The materials (m), and float32 (m, n, rows, cols) [mm]; none for an empty stage.
+
+        Raises:
+            ProjectorUnavailable: the projector does not answer.
+        """
+        views, *grid = cone.shape
         if not sample.name:
-            return {}
-        view = sample.offset.to_sample(cone)
+            return (), np.empty((0, views, *grid), dtype=np.float32)
         async with self._sent(sample, "material") as apart:
-            return {
-                channel.material.name: float(
-                    (await self.projector.project(name, view, (1, 1))).sum()
-                )
-                for channel, name in zip(apart.found, apart.names, strict=True)
-            }
+            out = await self._along(apart, sample.offset.to_sample(cone))
+            return apart.found, out
+
+    async def nominal_integrals(self, sample: Sample, cone: ConeVec) -> Float32Array:
+        """Line integrals, float32 (n, rows, cols), else as `nominal_paths`."""
+        views, *grid = cone.shape
+        if not sample.name:
+            return np.zeros((views, *grid), dtype=np.float32)
+        async with self._sent(sample, "part") as apart:
+            parts = await self._along(apart, sample.offset.to_sample(cone))
+            factors = np.array([factor for _, factor in apart.found], dtype=np.float32)
+            return np.asarray(np.tensordot(factors, parts, axes=1), dtype=np.float32)
+
+    async def _along(self, apart: _Apart, cone: ConeVec) -> Float32Array:
+        """Project each piece of a sample, float32 (pieces, n, rows, cols)."""
+        views, *grid = cone.shape
+        out = np.empty((len(apart.names), views, *grid), dtype=np.float32)
+        for i, name in enumerate(apart.names):
+            out[i] = await self.projector.project(name, cone, cone.of_shape(None))
+        return out
 
     async def scatterer(self, sample: Sample, voxels: int) -> Object:
         """The materials of `sample` on a grid of about so many voxels, made once."""

@@ -39,10 +39,11 @@ from flexdt.twin.physics import scatter as mc
 from flexdt.twin.physics.chain import Chain, Radiograph, Scattered, radiographs, without_spot
 from flexdt.twin.physics.detector import Detector, detector_of
 from flexdt.twin.physics.exposure import ExposureSettings
-from flexdt.twin.physics.predicted_beam import Physics
+from flexdt.twin.physics.predicted_beam import CountShares, Physics
 from flexdt.twin.physics.readout import Expected, expected_counts, read_out
 from flexdt.twin.physics.tube import TubeModel, tube_of, voltages
 from flexdt.twin.scanner.state import Sample
+from flexdt.twin.script.planning.sample_findings import SampleProbe, shares_behind
 
 SCATTER: Final = mc.ScatterSettings()
 FORGOTTEN_S: Final = 10.0
@@ -213,6 +214,27 @@ class Radiography:
             mc.view_scatter(thing, view, camera.shape, beams[exposure.kV], SCATTER)
             for view, exposure in zip(views, exposures, strict=True)
         ]
+
+    async def predicted_shares(self, sample: Sample, probe: SampleProbe) -> CountShares:
+        """Predict the saturated and starved parts of a setting's pixels behind a sample.
+
+        Args:
+            sample: that the scan is to show; nominal geometry, nothing hidden.
+            probe: setting, and the rays that are looked at.
+
+        Raises:
+            ProjectorUnavailable: the projector does not answer.
+            LimitError: a voltage without a spectrum.
+        """
+        cone = probe.cone_vec
+        if self.physics == "ideal":
+            lines = await self.imaging.nominal_integrals(sample, cone)
+            counts = np.exp(-lines) * np.float32(ideal.open_beam(self.model, probe.exposure))
+            return CountShares.of(counts, self.saturating)
+        parts, paths = await self.imaging.nominal_paths(sample, cone)
+        mono_keV = stated_keV() if self.physics == "mono" else None
+        chain = chain_through(parts, self.panel, self.tube, mono_keV)
+        return await asyncio.to_thread(shares_behind, chain, probe, paths, cone.rows)
 
     def dark(self, camera: CameraSettings) -> Radiograph:
         """An image without X-rays."""

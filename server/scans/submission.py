@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import partial
+from typing import Final
 
 from flexdt.protocol import Codec
 from flexdt.protocol.messages import Encoded
@@ -22,6 +23,7 @@ from flexdt.protocol.rpc_errors import RpcError, busy, invalid_params, problem
 from flexdt.runtime.files.dataset_folder import dated_name, read_document
 from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.files.own_documents import Changes
+from flexdt.runtime.wire_errors import ProjectorUnavailable
 from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.scans.acquisition import Acquisition, FrameListener
 from flexdt.server.scans.checking import CheckInput, Checks
@@ -37,13 +39,38 @@ from flexdt.server.storage.memory import Memory, StateStore
 from flexdt.twin.dataset import dataset_errors as ds
 from flexdt.twin.dataset.file_names import DOCUMENT, SCAN_SETTINGS, SCRIPT, XRE_SETTINGS, plain_name
 from flexdt.twin.dataset.flexdt_json import NoiseRecord, SampleRecord, ScanRecord
+from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import check_cone_vec
+from flexdt.twin.physics.predicted_beam import CountShares, PredictedExposure
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.scanner.state import Sample
-from flexdt.twin.script import ScanPlan, StartState
+from flexdt.twin.script import ScanPlan, ScriptProblem, StartState
+from flexdt.twin.script.planning.open_beam_findings import open_beam_problems
+from flexdt.twin.script.planning.sample_findings import (
+    SampleProbe,
+    predicted_exposures,
+    sample_probes,
+    sample_problems,
+)
 
 RESERVED = ("corrections", FOLDER, "samples")
 """Folders of the data directory that are no data sets."""
+PREDICTION_PATIENCE_S: Final = 1.0
+"""How long a submission waits for a projector that is busy before it goes on without a prediction
+of the sample."""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What the counts of a scan's projections will be.
+
+    Attributes:
+        exposures: of each setting of tube and camera, for the data set.
+        problems: warnings of pixels behind the sample, for whoever submits.
+    """
+
+    exposures: tuple[PredictedExposure, ...]
+    problems: tuple[ScriptProblem, ...]
 
 
 @dataclass(eq=False, repr=False)
@@ -77,6 +104,10 @@ class Submissions:
     version: str
     room: DiskRoom
     checks: Checks = field(default_factory=Checks)
+    _predicting: set[asyncio.Task[list[CountShares | None]]] = field(
+        default_factory=set, init=False
+    )
+    """Predictions under way."""
     _numbered: tuple[str, int] = field(default=("", 1), init=False)
     """A day, and the number of its scan that was named last."""
 
@@ -90,8 +121,10 @@ class Submissions:
         return Encoded(tuple(await self.checks.report(matter, codec)))
 
     def close(self) -> None:
-        """End what checks."""
+        """End what checks and predicts."""
         self.checks.close()
+        for task in self._predicting:
+            task.cancel()
 
     async def submit(
         self,
@@ -202,7 +235,8 @@ class Submissions:
         self._ensure_same(begin)
         await asyncio.to_thread(self._require_room, checked.plan.bytes, name)
         await self.radiography.require_room(begin.sample)
-        warnings = list(checked.warnings)
+        predicted = await self._predicted(begin, checked.plan)
+        warnings = [*checked.warnings, *(p.where_and_what for p in predicted.problems)]
         if resume:
             there = sum(n.endswith(".tif") for n in self.root.folder(name).names())
             warnings.insert(0, f"taking up the data set {name}, of which {there} images exist")
@@ -225,9 +259,48 @@ class Submissions:
             self._ensure_same(begun.begin)
             shows = begun.begin.revision or self.stage.revision(begun.begin.sample)
             begun = replace(begun, begin=replace(begun.begin, revision=shows))
-            return await asyncio.to_thread(self._open, begun, final.plan, name, resume)
+            same = final is checked and begun.begin.sample == asked.begin.sample
+            counts = predicted if same else await self._predicted(begun.begin, final.plan)
+            return await asyncio.to_thread(
+                self._open, begun, final.plan, name, resume, counts.exposures
+            )
 
         return checked.plan, prepare, warnings
+
+    async def _predicted(self, begin: StartConditions, plan: ScanPlan) -> Prediction:
+        """Predict the counts of a scan's projections; of the sample only if it can be projected."""
+        probes = sample_probes(plan)
+        shares = await self._shares(begin, probes)
+
+        def judged() -> Prediction:
+            known = open_beam_problems(plan, begin.physics)
+            return Prediction(
+                predicted_exposures(plan, probes, shares, begin.physics),
+                sample_problems(probes, shares, known),
+            )
+
+        return await asyncio.to_thread(judged)
+
+    async def _shares(
+        self, begin: StartConditions, probes: Sequence[SampleProbe]
+    ) -> list[CountShares | None]:
+        """Predict the pixels of each probe; None where the projector does not tell in time.
+
+        A prediction ends no submission: what is wrong with the sample, the scan itself says.
+        """
+        radiography = replace(self.radiography, physics=begin.physics, scatter=begin.scatter)
+
+        async def each() -> list[CountShares | None]:
+            with suppress(ProjectorUnavailable, RpcError, TwinError):
+                return [await radiography.predicted_shares(begin.sample, one) for one in probes]
+            return [None] * len(probes)
+
+        task = asyncio.create_task(each())
+        self._predicting.add(task)
+        task.add_done_callback(self._predicting.discard)
+        # What is sent to the projector meanwhile, the scan needs as well: it is not cancelled.
+        done, _ = await asyncio.wait({task}, timeout=PREDICTION_PATIENCE_S)
+        return task.result() if done else [None] * len(probes)
 
     async def _matter(self, wish: ScanSource, start: StartState, shown: Sample) -> CheckInput:
         """What may collide stands on the stage; what the beam sees is `shown`."""
@@ -257,7 +330,14 @@ class Submissions:
             xrays_on=s.tube.on,
         )
 
-    def _open(self, asked: JobRecord, plan: ScanPlan, name: str, resume: bool) -> JobInputs:
+    def _open(
+        self,
+        asked: JobRecord,
+        plan: ScanPlan,
+        name: str,
+        resume: bool,
+        predicted: tuple[PredictedExposure, ...],
+    ) -> JobInputs:
         """Make (or take up) the data set and all that runs the plan; in a worker thread."""
         begin = asked.begin
         radiography = replace(self.radiography, physics=begin.physics, scatter=begin.scatter)
@@ -276,6 +356,7 @@ class Submissions:
             correction=self.scanner.correction,
             operator=asked.operator,
             version=self.version,
+            predicted=predicted,
         )
         for block in record.blocks:
             pixel = block.camera.pixels_mm(plan.machine.detector.pixels)

@@ -74,6 +74,16 @@ def test_run_and_snap_say_what_their_images_are(tmp_path: Path, capsys: Capture)
         assert share(capsys.readouterr().err, "saturated") == pytest.approx(
             (tifffile.imread(snapped) == TOP).mean(), abs=0.02
         )
+        dim = written(tmp_path, 20.0, 25.0)
+        capsys.readouterr()
+        assert run(["run", str(dim), "--out", "dim", *server]) == 0
+        predicted = re.findall(r"about ([\d.e+-]+) % .* will be starved", capsys.readouterr().err)
+        [kept] = json.loads((tmp_path / "data/dim/flexdt.json").read_text())["predicted"]
+        signal = [image.astype(float) - tifffile.imread(tmp_path / "data/dim/di000000.tif")
+                  for image in map(tifffile.imread, (tmp_path / "data/dim").glob("scan_*.tif"))]  # fmt: skip
+        starved = max(float((image < 10).mean()) for image in signal)
+        assert kept["starved"] == pytest.approx(starved, abs=0.03)
+        assert [float(one) / 100 for one in predicted] == [pytest.approx(kept["starved"], rel=0.01)]
         short = written(tmp_path, 60.0)
         capsys.readouterr()
         assert run(["run", str(short), "--out", "short", *server]) == 0

@@ -58,6 +58,8 @@ class PointProjector:
         assert name in self.names
         if self.down:
             raise ProjectorUnavailable("no projector at test")
+        if cone_vec.detector_shape is not None:  # a prediction's rays, no view of a scan
+            return np.zeros((len(cone_vec), *shape), dtype=np.float32)
         await asyncio.sleep(self.delay_s)
         while self.limit is not None and self.views >= self.limit:
             await asyncio.sleep(0.001)

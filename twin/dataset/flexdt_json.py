@@ -31,6 +31,7 @@ from flexdt.twin.json_text import parse_json
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.machine.kinematics import motor_poses
+from flexdt.twin.physics.predicted_beam import PredictedExposure
 from flexdt.twin.scanner.state import NamedCorrection
 from flexdt.twin.script import SampleSize, ScanPlan
 from flexdt.twin.script.planning.plan import saved_images
@@ -126,6 +127,7 @@ class ScanRecord(ArrayValue):
         operator: who submitted it.
         flat_axis: the motor that took the sample out of the beam, "" if none.
         version: of the software.
+        predicted: counts of the projections' settings, as they were predicted at submission.
     """
 
     name: str
@@ -149,6 +151,7 @@ class ScanRecord(ArrayValue):
     operator: str = ""
     flat_axis: str = ""
     version: str = ""
+    predicted: tuple[PredictedExposure, ...] = ()
 
     def __repr__(self) -> str:
         return (
@@ -168,6 +171,7 @@ class ScanRecord(ArrayValue):
         correction: NamedCorrection | None = None,
         operator: str = "",
         version: str = "",
+        predicted: tuple[PredictedExposure, ...] = (),
     ) -> ScanRecord:
         """The record of a plan that is about to run; `complete` is False.
 
@@ -209,6 +213,7 @@ class ScanRecord(ArrayValue):
             operator=operator,
             flat_axis=_flat_axis(plan.machine, blocks),
             version=version,
+            predicted=predicted,
         )
 
     @property
@@ -375,6 +380,41 @@ class CorrectionEntry(_Model):
         return cls(name=c.name, date=c.date, note=c.note, parameters=c.parameters.to_edge())
 
 
+class PredictedEntry(_Model):
+    """What a setting was predicted to give when the scan was submitted."""
+
+    kV: float
+    power_W: float
+    exposure_ms: float
+    open_beam_fill: float | None = None
+    """Counts of the open beam over the panel's range, saturated from 1; null: not known."""
+    saturated: float | None = None
+    """Part of the projections' pixels; null: not known."""
+    starved: float | None = None
+    """Part of the projections' pixels; null: not known."""
+    doubts: list[str] = Field(default_factory=list)
+    """What the prediction says against the setting."""
+
+    @classmethod
+    def of(cls, predicted: PredictedExposure) -> PredictedEntry:
+        """Make the entry of a prediction."""
+        shares = predicted.shares
+        return cls(
+            kV=predicted.kV,
+            power_W=predicted.power_W,
+            exposure_ms=predicted.exposure_ms,
+            open_beam_fill=_rounded(predicted.open_beam_fill),
+            saturated=None if shares is None else _rounded(shares.saturated),
+            starved=None if shares is None else _rounded(shares.starved),
+            doubts=list(predicted.doubts),
+        )
+
+
+def _rounded(value: float | None) -> float | None:
+    """Round to the digits that a prediction has."""
+    return None if value is None else float(f"{value:.4g}")
+
+
 class DatasetDocument(_Model):
     """The content of `flexdt.json`."""
 
@@ -398,6 +438,8 @@ class DatasetDocument(_Model):
     correction: CorrectionEntry | None = None
     settings_positions: dict[str, float] = Field(default_factory=dict)
     """Motor -> position when the settings texts were written [mm, deg], script's sign."""
+    predicted: list[PredictedEntry] = Field(default_factory=list)
+    """Counts of each setting of the projections, predicted at submission; none in older files."""
     frames: list[FrameEntry]
 
     @classmethod
@@ -429,6 +471,7 @@ class DatasetDocument(_Model):
             noise=record.noise,
             correction=CorrectionEntry.of(record.correction),
             settings_positions=dict(record.positions),
+            predicted=[PredictedEntry.of(one) for one in record.predicted],
             frames=[
                 entry for b in record.blocks if len(b) for entry in FrameEntry.all_of(record, b)
             ],

@@ -1,21 +1,23 @@
-"""Predict the counts of the open beam before an image is exposed."""
+"""Predict the counts of the open beam, and behind the sample, before an image is exposed."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Final, Literal
 
+import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.errors import LimitError
+from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.physics import exposure as ideal
-from flexdt.twin.physics.chain import Chain, flux_of
+from flexdt.twin.physics.chain import Chain, expected_signal, flux_of
 from flexdt.twin.physics.detector import detector_of
 from flexdt.twin.physics.exposure import ExposureSettings
 from flexdt.twin.physics.image_quality import pixel_reading
-from flexdt.twin.physics.readout import saturating_counts
+from flexdt.twin.physics.readout import expected_counts, saturating_counts
 from flexdt.twin.physics.tube import tube_of
 
 Physics = Literal["ideal", "mono", "poly"]
@@ -52,6 +54,75 @@ class OpenBeam:
     def starved(self) -> bool:
         """Whether there is too little light to see through a sample."""
         return self.counts < LEAST_COUNTS
+
+
+@dataclass(frozen=True)
+class CountShares:
+    """Parts of the pixels whose counts tell little, 0 to 1.
+
+    Attributes:
+        saturated: with the panel's largest count.
+        starved: with fewer than `FEW_COUNTS` above dark.
+    """
+
+    saturated: float
+    starved: float
+
+    @classmethod
+    def of(cls, counts: npt.NDArray[np.floating], full_counts: float) -> CountShares:
+        """Count the pixels of images.
+
+        Args:
+            counts: expected above dark, not clipped, of any shape.
+            full_counts: counts above dark from which a pixel is saturated.
+        """
+        starved = counts < ideal.FEW_COUNTS
+        return cls(float((counts >= full_counts).mean()), float(starved.mean()))
+
+
+@dataclass(frozen=True)
+class PredictedExposure:
+    """What a setting of tube and camera was predicted to give before its images were made.
+
+    Attributes:
+        kV, power_W, exposure_ms: the setting, of one read-out.
+        open_beam_fill: counts of the open beam over the panel's range, saturated from 1; None where
+            the physics has no spectrum for the voltage.
+        shares: of the pixels behind the sample; None where that is not known.
+        doubts: what the prediction says against the setting, with what would do.
+    """
+
+    kV: float
+    power_W: float
+    exposure_ms: float
+    open_beam_fill: float | None = None
+    shares: CountShares | None = None
+    doubts: tuple[str, ...] = ()
+
+
+def counts_behind(
+    chain: Chain,
+    camera: CameraSettings,
+    exposure: ExposureSettings,
+    paths_mm: Float32Array,
+    view: npt.ArrayLike,
+    pixels_a_side: int = 1,
+) -> Float32Array:
+    """Predict the counts above dark of an image without noise, not clipped.
+
+    Args:
+        chain: tube, materials, panel.
+        camera: its mode decides the electrons in a count.
+        exposure: tube and time; X-rays are on.
+        paths_mm: path through each of the chain's substances, float32 (m, rows, cols) [mm].
+        view: cone_vec row (12,) of these pixels.
+        pixels_a_side: of the camera, that each of these pixels stands for.
+
+    Returns:
+        Of one pixel of the camera in the place of each of these, float32 (rows, cols).
+    """
+    charge = expected_signal(chain, paths_mm, view, exposure).mean_e
+    return expected_counts(chain.panel, camera, charge / np.float32(pixels_a_side**2))
 
 
 def open_beam_of(

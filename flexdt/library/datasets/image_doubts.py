@@ -2,20 +2,62 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from flexdt.library.datasets.image_set import Counts, ImageSet, flats_of
-from flexdt.twin.dataset.dataset_errors import DatasetFormatError
+from flexdt.runtime.files.dataset_folder import read_image
+from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetFormatError
 from flexdt.twin.physics.exposure import FEW_COUNTS, NOTICED
 from flexdt.twin.plausibility import settled
 from flexdt.twin.plausibility.reference_images import beam_findings, flat_findings, open_beam
 
 MAX_FROM_DISK: Final = 32
 """Radiographs in files that are looked at."""
+RADIOGRAPHS: Final = "radiographs"
+FLAT_IMAGE: Final = "flat image"
+SATURATED: Final = "are saturated, where attenuation comes out wrong"
+"""What every sentence of saturated images holds."""
 DARK: Final = "no pixel of the flat images is brighter than the dark ones: was the tube off?"
+
+
+def saturated_part(what: str, share: float) -> str:
+    """Say which part of some images' pixels is saturated, and what would do.
+
+    Args:
+        what: which images.
+        share: of their pixels, 0 to 1.
+    """
+    return (
+        f"{100.0 * share:.3g} % of the pixels of the {what} {SATURATED}: lower the tube's power or "
+        "the exposure"
+    )
+
+
+def first_look(paths: Mapping[str, Path], full_scale: int | None) -> list[str]:
+    """Say whether images are saturated, before anything is computed of them.
+
+    Args:
+        paths: one image of each kind, which the sentence names. One that cannot be read is passed
+            over: whoever reads it is told.
+        full_scale: largest count of the panel; None where it is not known, and nothing is said.
+
+    Returns:
+        At most one sentence, of the first kind that is saturated.
+    """
+    for what, path in paths.items():
+        if full_scale is None:
+            break
+        try:
+            share = float((read_image(path) >= full_scale).mean())
+        except (OSError, DatasetError):
+            continue
+        if share >= NOTICED:
+            return [saturated_part(what, share)]
+    return []
 
 
 def image_doubts(
@@ -66,16 +108,11 @@ def image_doubts(
             beam.append(open_beam(image, dark, opened))
         saturated, starved = np.mean(each, axis=0)
         shares = {
-            "radiographs": float(saturated),
-            "flat image": float((flat[alive] >= top).mean()),
+            RADIOGRAPHS: float(saturated),
+            FLAT_IMAGE: float((flat[alive] >= top).mean()),
         }
         held = min(shares.values()) <= 1.0 - NOTICED
-        doubts = [
-            f"{100.0 * share:.3g} % of the pixels of the {what} are saturated, where attenuation "
-            "comes out wrong: lower the tube's power or the exposure"
-            for what, share in shares.items()
-            if share >= NOTICED
-        ]
+        doubts = [saturated_part(what, share) for what, share in shares.items() if share >= NOTICED]
         if starved >= NOTICED:
             doubts.append(
                 f"{100.0 * starved:.3g} % of the pixels of the radiographs are starved (fewer "

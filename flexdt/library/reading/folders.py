@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.library.data_set import DataSet
+from flexdt.library.datasets.image_doubts import SATURATED
 from flexdt.library.reading.foreign_files import open_file
 from flexdt.library.reading.listed_images import NO_DARK, in_order, listed
 from flexdt.runtime.files.dataset_folder import (
@@ -29,7 +30,7 @@ from flexdt.runtime.files.dataset_folder import (
 )
 from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetFormatError, DatasetMissingError
 from flexdt.twin.dataset.file_names import DOCUMENT, GEOMETRY, SCAN_SETTINGS, XRE_SETTINGS
-from flexdt.twin.dataset.flexdt_json import parse_document
+from flexdt.twin.dataset.flexdt_json import DatasetDocument, parse_document
 from flexdt.twin.dataset.normalise import of_intensities
 from flexdt.twin.dataset.rebuild import rebuild
 from flexdt.twin.dataset.scan_settings import ScanSettings
@@ -196,7 +197,7 @@ def _from_document(content: Folder, machine: Machine | None, profile: Profile | 
     settings = read_settings(content, warnings)
     if np.abs(found.cone_vec().rows - cone_vec.rows).max() > AGREE_MM:
         warnings.append(f"{path}: cone_vec does not follow from its motor positions")
-    return listed(
+    made = listed(
         content,
         cone_vec,
         files,
@@ -215,6 +216,18 @@ def _from_document(content: Folder, machine: Machine | None, profile: Profile | 
         document=doc,
         full_scale=(1 << machine.detector.bits) - 1,
     )
+    return replace(made, warnings=(*made.warnings, *_predicted_doubts(doc, made.warnings)))
+
+
+def _predicted_doubts(doc: DatasetDocument, seen: Sequence[str]) -> list[str]:
+    """Say what was predicted against a scan's exposure, where its images have not said it."""
+    saturated = any(SATURATED in one for one in seen)
+    return [
+        f"predicted at submission: {doubt}"
+        for one in doc.predicted
+        for doubt in one.doubts
+        if not (saturated and "saturate" in doubt)
+    ]
 
 
 def _from_geometry(content: Folder) -> DataSet:

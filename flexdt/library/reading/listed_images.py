@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Final
 
 from flexdt.library.data_set import DataSet
+from flexdt.library.datasets.image_doubts import FLAT_IMAGE, RADIOGRAPHS, SATURATED, first_look
 from flexdt.runtime.files.dataset_folder import Folder, Frame, blank_images, read_image
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetMissingError
 from flexdt.twin.errors import TwinError
@@ -64,6 +66,7 @@ def listed(
     shapes: Sequence[tuple[int, int]] = (),
     reasons: Sequence[str] = (),
     warnings: Sequence[str] = (),
+    full_scale: int | None = None,
     **known: Any,
 ) -> DataSet:
     """The data set of images named one by one.
@@ -76,6 +79,7 @@ def listed(
         shapes: (rows, cols) of each projection; default: all as the first that is there.
         reasons: why it is not complete.
         warnings: what is doubtful.
+        full_scale: largest count of the panel, to say whether images are saturated; None: unknown.
         known: further members of `DataSet`.
 
     Raises:
@@ -98,19 +102,32 @@ def listed(
     lost, blank = content.lost((*darks, *flats, *names)), blank_images(content, names)
     reasons = [reason for reason in (*reasons, lost, nothing_in(blank)) if reason]
     content = replace(content, names=content.names.difference(blank))
+    frames, flat_paths = content.frames(names, shapes), content.paths(flats)
+    if not any(SATURATED in told for told in warnings):
+        warnings = [*warnings, *_first_look(frames, flat_paths, full_scale)]
     return DataSet(
         name or content.path.name,
-        content.frames(names, shapes),
+        frames,
         shapes[0],
         geometry,
         folder=content.path,
         darks=content.paths(darks),
-        flats=content.paths(flats),
+        flats=flat_paths,
         complete=not reasons,
         reason="; ".join(reasons),
         warnings=(*warnings, *([] if darks else [f"{NO_DARK} (di000000.tif): zero is taken"])),
+        full_scale=full_scale,
         **known,
     )
+
+
+def _first_look(
+    frames: Sequence[Frame], flats: Sequence[Path], full_scale: int | None
+) -> list[str]:
+    """Say whether the first flat image is saturated, or the projection in the middle."""
+    taken = [frame.path for frame in frames if frame.present and frame.path is not None]
+    kinds = {FLAT_IMAGE: [*flats], RADIOGRAPHS: taken[len(taken) // 2 :]}
+    return first_look({what: paths[0] for what, paths in kinds.items() if paths}, full_scale)
 
 
 def nothing_in(blank: Sequence[str]) -> str:

@@ -41,7 +41,7 @@ def open_beam_problems(plan: ScanPlan, physics: Physics = "poly") -> tuple[Scrip
     """
     problems: list[ScriptProblem] = []
     for (exposure, camera), (line, indices) in lit_settings(plan).items():
-        beam = _brightest(plan, exposure, camera, indices, physics)
+        beam = brightest_beam(plan, exposure, camera, indices, physics)
         if beam is None:
             continue
         doubt = open_beam_doubt(plan.machine, exposure, beam)
@@ -76,7 +76,7 @@ def lit_settings(
     return found
 
 
-def _brightest(
+def brightest_beam(
     plan: ScanPlan,
     exposure: ExposureSettings,
     camera: CameraSettings,

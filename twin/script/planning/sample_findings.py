@@ -1,0 +1,170 @@
+"""Warn of projections of a plan whose pixels the sample starves, or nothing shades enough.
+
+What the rays meet is not known here: `sample_probes` says which rays are looked at, whoever has the
+sample projects it along them, and `predicted_exposures` judges the counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.machine.camera import CameraSettings
+from flexdt.twin.machine.kinematics import motor_poses
+from flexdt.twin.physics.chain import Chain
+from flexdt.twin.physics.exposure import NOTICED, ExposureSettings
+from flexdt.twin.physics.predicted_beam import (
+    CountShares,
+    Physics,
+    PredictedExposure,
+    counts_behind,
+    open_beam_doubt,
+)
+from flexdt.twin.physics.readout import saturating_counts
+from flexdt.twin.script.planning.open_beam_findings import brightest_beam, lit_settings
+from flexdt.twin.script.planning.plan import ScanPlan
+from flexdt.twin.script.problems import ScriptProblem
+
+PROBE_VIEWS: Final = 3
+"""Views of each setting that are looked at."""
+PROBE_SETTINGS: Final = 4
+"""Settings of tube and camera that are looked at, the first ones."""
+PROBE_RAYS: Final = 128
+"""Rays along the longer side of a panel, at least, where it has so many pixels."""
+SHARE_NAMES: Final = ("saturated", "starved")
+"""Members of `CountShares`; warnings have codes such as `starved_pixels`."""
+
+
+@dataclass(frozen=True, eq=False)
+class SampleProbe:
+    """Rays of some views of a setting of tube and camera.
+
+    Attributes:
+        line: of the script, that first uses the setting.
+        exposure, camera: the setting, of one read-out.
+        cone_vec: views of `PROBE_RAYS` a side, with the shape (rows, cols) of the grid of rays.
+        pixels_a_side: of the camera, that each ray stands for.
+        indices: of all images of the setting.
+    """
+
+    line: int
+    exposure: ExposureSettings
+    camera: CameraSettings
+    cone_vec: ConeVec
+    pixels_a_side: int
+    indices: tuple[int, ...]
+
+
+def sample_probes(plan: ScanPlan) -> tuple[SampleProbe, ...]:
+    """Choose the rays that tell how the projections of a plan are exposed.
+
+    Args:
+        plan: with the saved images, their settings and positions.
+    """
+    settings = lit_settings(plan, kinds=("projection",))
+    probes: list[SampleProbe] = []
+    for (exposure, camera), (line, indices) in list(settings.items())[:PROBE_SETTINGS]:
+        some = np.unique(np.linspace(0, len(indices) - 1, PROBE_VIEWS).astype(int))
+        chosen = [indices[i] for i in some]
+        positions = {name: x[chosen] for name, x in plan.image_positions.items()}
+        cone = motor_poses(plan.machine, plan.profile, camera, positions).cone_vec()
+        step = min(max(1, max(camera.shape) // PROBE_RAYS), *camera.shape)
+        coarse = cone.with_shape(camera.shape).binned(step)
+        probes.append(SampleProbe(line, exposure, camera, coarse, step, tuple(indices)))
+    return tuple(probes)
+
+
+def shares_behind(
+    chain: Chain, probe: SampleProbe, paths_mm: Float32Array, rows: FloatArray
+) -> CountShares:
+    """Count the saturated and the starved pixels of a probe's views.
+
+    Args:
+        chain: tube, materials of the sample, panel.
+        probe: the views.
+        paths_mm: path through each material along its rays, float32 (m, n, rows, cols) [mm].
+        rows: cone_vec of the views, (n, 12).
+    """
+    counts = [
+        counts_behind(
+            chain, probe.camera, probe.exposure, paths_mm[:, i], view, probe.pixels_a_side
+        )
+        for i, view in enumerate(rows)
+    ]
+    return CountShares.of(np.stack(counts), saturating_counts(chain.panel))
+
+
+def predicted_exposures(
+    plan: ScanPlan,
+    probes: Sequence[SampleProbe],
+    shares: Sequence[CountShares | None],
+    physics: Physics = "poly",
+) -> tuple[PredictedExposure, ...]:
+    """Predict each setting of a plan's projections, with what speaks against it.
+
+    Args:
+        plan: that the probes are of.
+        probes: from `sample_probes`.
+        shares: of the pixels of each probe's views; None where the sample is not known.
+        physics: how counts are made.
+    """
+    return tuple(
+        _predicted(plan, probe, seen, physics) for probe, seen in zip(probes, shares, strict=True)
+    )
+
+
+def _predicted(
+    plan: ScanPlan, probe: SampleProbe, seen: CountShares | None, physics: Physics
+) -> PredictedExposure:
+    """Predict one setting."""
+    lit = probe.exposure
+    made = PredictedExposure(lit.kV, lit.power_W, lit.exposure_ms, shares=seen)
+    beam = brightest_beam(plan, lit, probe.camera, list(probe.indices), physics)
+    known = ""
+    if beam is not None:
+        doubt = open_beam_doubt(plan.machine, lit, beam)
+        made = replace(made, open_beam_fill=beam.fill, doubts=() if doubt is None else (doubt,))
+        known = "saturated" if beam.saturated else "starved" if beam.starved else ""
+    told = [text for name, text in _sentences(seen) if name != known]
+    return replace(made, doubts=(*made.doubts, *told))
+
+
+def sample_problems(
+    probes: Sequence[SampleProbe],
+    shares: Sequence[CountShares | None],
+    known: Sequence[ScriptProblem] = (),
+) -> tuple[ScriptProblem, ...]:
+    """Warn of settings whose projections have saturated or starved pixels.
+
+    Args:
+        probes: from `sample_probes`.
+        shares: of the pixels of each probe's views.
+        known: warnings of the open beam, which explain pixels of the same kind.
+
+    Returns:
+        Warnings `saturated_pixels` and `starved_pixels`.
+    """
+    explained = {(p.code, p.line) for p in known}
+    return tuple(
+        ScriptProblem("warning", f"{name}_pixels", probe.line, 1, text)
+        for probe, seen in zip(probes, shares, strict=True)
+        for name, text in _sentences(seen)
+        if (f"{name}_open_beam", probe.line) not in explained
+    )
+
+
+def _sentences(seen: CountShares | None) -> list[tuple[str, str]]:
+    """Say which parts of the pixels are worth a warning: (name, sentence) each."""
+    if seen is None:
+        return []
+    shares = [(name, getattr(seen, name)) for name in SHARE_NAMES]
+    return [
+        (name, f"about {100 * share:.3g} % of the projections' pixels will be {name}")
+        for name, share in shares
+        if share >= NOTICED
+    ]
