@@ -174,6 +174,10 @@ class JobStatus(Result):
     """line of the script being run"""
     what: str = ""
     """what is being done now, for people"""
+    ended_by: str | None = None
+    """connection that aborted it, named as in `controller`; null where nobody did"""
+    start: dict[str, float] | None = None
+    """where the motors stood when it began [mm, deg]; null before that"""
 
 
 class ImageFlags(Result):
@@ -214,6 +218,9 @@ class State(Result):
     unsaved: str | None = None
     """why this state is not on the server's disk, as after an E-stop on a disk that fails: a server
     that is killed now comes back without it; null where it is, or is being written"""
+    projector: str | None = None
+    """why no image can be computed now, as where no projector answers; null where nothing is wrong,
+    or nobody looks"""
 
 
 class Stopping(Result):

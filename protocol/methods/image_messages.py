@@ -12,7 +12,7 @@ from flexdt.protocol import fields as f
 from flexdt.protocol.method import read
 from flexdt.protocol.methods.document_messages import Averages, Frames
 from flexdt.protocol.methods.scanner_messages import CameraSet, TubeSet
-from flexdt.protocol.state_model import GeometryResult, ImageFlags
+from flexdt.protocol.state_model import GeometryResult, ImageFlags, SamplePlacement
 
 LayerText = Annotated[f.ShortText, MaxLen(100)]
 ScanKind = Literal["fly", "step", "tiled", "helical", "calibration"]
@@ -71,6 +71,27 @@ class ExposurePredict(f.Params):
     """MATERIAL:MM or void:MM on the darkest ray, to be seen"""
 
 
+class ImageOrigin(f.Result):
+    """What an image was made of, beside its geometry: compare it with the state."""
+
+    sample: str | None
+    """name of what it shows; null for an empty stage"""
+    revision: str | None = None
+    """of an upload, as in the state"""
+    material: str | None = None
+    offset: SamplePlacement
+    lit: bool
+    """whether X-rays were on and ready"""
+    kV: float
+    power_W: float
+    mode: str
+    exposure_ms: float
+    averages: int
+    roi: f.Roi
+    correction: str | None = None
+    """name of the one that its geometry has"""
+
+
 class Projection(f.ImageValue):
     """An image and the geometry it was made with (nominal plus correction)."""
 
@@ -79,6 +100,8 @@ class Projection(f.ImageValue):
     time: float | None = None
     """of the pose, on the twin's clock [s]"""
     flags: ImageFlags | None = None
+    origin: ImageOrigin | None = None
+    """what it was made of"""
     marks: f.ImageValue | None = None
     """uint8, as large as the image, where asked for: sum of 1 saturated, 2 starved, 4 sample cut
     off at this pixel of the edge; judged as though X-rays were on"""

@@ -144,6 +144,8 @@ class CheckResult(f.Result):
     collisions: list[CheckCollision] = Field(default_factory=list)
     min_clearance_mm: float | None = None
     """of parts in relative motion"""
+    min_clearance_pair: list[str] | None = None
+    """the two parts that come so close"""
 
 
 class SubmitResult(f.Result):

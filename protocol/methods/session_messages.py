@@ -84,6 +84,8 @@ class HelloResult(Result):
     """this connection's name, as in `controller`"""
     physics: str | None = None
     """how images are made: ideal, mono or poly"""
+    instance: str | None = None
+    """made up when the server started: what was made of another one may not hold any more"""
 
 
 class ControlResult(Result):

@@ -199,6 +199,8 @@ class Jobs:
             step=None if step is None else step.index,
             line=None if step is None else step.line,
             what="" if p is None or job.phase in ENDED else p.what,
+            ended_by=job.ended_by,
+            start=job.start,
         )
 
     # Commanding ---------------------------------------------------------------------------------
@@ -233,7 +235,7 @@ class Jobs:
             raise self._cannot("resume", job, ENDED)
         return replace(
             job or Job(f"job-{self._count + 1}", name, folder), prepare=prepare, phase="queued",
-            error=None, ended=None, speed_up=speed_up, frames_total=plan.frames,
+            error=None, ended=None, ended_by=None, speed_up=speed_up, frames_total=plan.frames,
             duration_s=plan.duration_s, warnings=warnings or [], sample=sample,
         )  # fmt: skip
 
@@ -271,9 +273,20 @@ class Jobs:
         self._take_over()
         runner.step()
 
-    def abort(self, job: Job, reason: str | None = None) -> None:
-        """End a job in any phase; its data set stays, incomplete, with the reason."""
-        if job.runner is not None and job.phase not in ENDED:
+    def abort(self, job: Job, reason: str | None = None, by: str | None = None) -> None:
+        """End a job in any phase; its data set stays, incomplete, with the reason.
+
+        X-rays go off with a job that has begun.
+
+        Args:
+            job: to end; one that has ended stays as it is.
+            reason: for the data set.
+            by: connection that asks.
+        """
+        if job.phase in ENDED:
+            return
+        job.ended_by = job.ended_by or by
+        if job.runner is not None:
             job.runner.abort(reason)
         elif job.phase == "queued":
             job.phase, job.aborted_for, job.ended = "aborted", reason, self._today()
@@ -402,6 +415,8 @@ class Jobs:
             await self._clock.at_rest(self._scanner.rest_time)  # of motion from before the job
             assert job.prepare is not None
             self._preparing = True
+            if job.start is None:
+                job.start = self._scanner.final_positions()
             scan = await job.prepare()
         except Exception as error:
             return self._failed(job, error)
@@ -421,6 +436,8 @@ class Jobs:
             await asyncio.to_thread(scan.store.finish, duration_s=scan.plan.duration_s)
             await asyncio.to_thread(scan.finished)
         except JobAborted as ended:
+            if job.runner is not None:
+                self._scanner.set_tube(on=False, now=self._clock.now())
             await asyncio.to_thread(self._mark, job, scan, str(ended))
             return "aborted"
         except asyncio.CancelledError:

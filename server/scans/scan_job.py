@@ -60,6 +60,10 @@ class Job:
     frames_seen: int = 0
     ended: datetime | None = None
     """When it ended, by the server's calendar."""
+    ended_by: str | None = None
+    """The connection that aborted it."""
+    start: dict[str, float] | None = None
+    """Where the motors stood when it began [mm, deg]."""
     logged: str = ""
     """The state that the topic `log` was last told."""
 

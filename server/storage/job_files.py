@@ -37,6 +37,8 @@ class JobMemory(BaseModel):
 
     Attributes:
         ended: when it ended, by the server's calendar; None while it has not.
+        ended_by: connection that aborted it; None where nobody did.
+        start: where the motors stood when it began [mm, deg]; None before that.
     """
 
     model_config = ConfigDict(
@@ -55,6 +57,8 @@ class JobMemory(BaseModel):
     warnings: list[str] = Field(default_factory=list)
     error: dict[str, object] | None = None
     ended: datetime | None = None
+    ended_by: str | None = None
+    start: dict[str, float] | None = None
 
 
 class JobFile(JobMemory):

@@ -27,6 +27,7 @@ from flexdt.runtime.files.own_documents import settle
 from flexdt.runtime.log import LEVELS, log
 from flexdt.runtime.wire_errors import from_root
 from flexdt.server.imaging.projections import Imaging, Projector, TrueGeometry
+from flexdt.server.imaging.projector_watch import ProjectorWatch
 from flexdt.server.imaging.radiography import Radiography, predictors, with_spectra
 from flexdt.server.scans.jobs import Jobs, fresh_seed
 from flexdt.server.scans.scan_job import Job
@@ -41,7 +42,7 @@ from flexdt.server.storage.past_scans import PastScans
 from flexdt.server.storage.stored_samples import ReceivedSample, SampleStore, sample_material
 from flexdt.server.twin import state_views
 from flexdt.server.twin.hub import Hub
-from flexdt.server.twin.live import LiveView, Shot, StateFeed
+from flexdt.server.twin.live import LiveView, StateFeed
 from flexdt.twin.collision.first_contact import NearestPair, clearance
 from flexdt.twin.collision.guard import SceneGuard
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError
@@ -148,6 +149,7 @@ class TwinServer:
         wall: real time [s], monotonic; a simulation has its own.
         memory_limit: of the samples in memory [bytes]; None for any.
         projector_room: bytes that a projector can have for a sample; None if not known.
+        projector_watch: says why no image can be computed; None where nothing is watched.
     """
 
     def __init__(
@@ -167,9 +169,12 @@ class TwinServer:
         wall: Callable[[], float] = time.monotonic,
         memory_limit: int | None = None,
         projector_room: Callable[[], Awaitable[int | None]] | None = None,
+        projector_watch: ProjectorWatch | None = None,
     ) -> None:
         self.limits = TwinLimits() if limits is None else limits
         self.version = version("flexdt")
+        self.instance = secrets.token_hex(8)
+        """Names this run of the server."""
         machine = with_spectra(machine, physics)
         self.machine, self.profile = machine, profile
         self.directory, self.root = root, root.path
@@ -212,8 +217,9 @@ class TwinServer:
         )  # fmt: skip
         self.radiography = Radiography.of(self.imaging, machine, physics, scatter)
         self.live = LiveView(
-            self.scanner, self.clock, self.hub, self.radiography, lambda: self.jobs.busy
-        )
+            self.scanner, self.clock, self.hub, self.radiography, lambda: self.jobs.busy,
+            self.stage.revision,
+        )  # fmt: skip
         self.feed = StateFeed(
             self.scanner, self.clock, self.hub, self.state, lambda: self.jobs.running
         )
@@ -238,6 +244,10 @@ class TwinServer:
             version=self.version,
             room=room,
         )
+        self.projector_watch = projector_watch
+        if projector_watch is not None:
+            projector_watch.asks = lambda: self.hub.wanted("state")
+            projector_watch.changed = self.feed.changed
         self.failed = asyncio.Event()
         """Set when a part of the twin has died; the process should end."""
         self._tasks: list[asyncio.Task[None]] = []
@@ -259,6 +269,8 @@ class TwinServer:
             lambda: self.feed.run(self._settled),
             lambda: self.keeper.run(self._moving),
         ]
+        if self.projector_watch is not None:
+            work.append(self.projector_watch.run)
         self._tasks = [asyncio.create_task(self._guarded(w)) for w in work]
 
     async def stop(self) -> None:
@@ -364,6 +376,7 @@ class TwinServer:
         """
         snapshot = self.scanner.state(self.clock.now())
         job, problem = self.jobs.current, self.keeper.problem
+        watch = self.projector_watch
         return w.State(
             time=snapshot.time,
             axes={name: w.AxisState(**vars(axis)) for name, axis in snapshot.axes.items()},
@@ -380,6 +393,7 @@ class TwinServer:
             controller=self.control.holder,
             image=self.live.seen,
             unsaved=None if problem is None else str(from_root(problem, self.root)),
+            projector=None if watch is None else watch.problem,
         )
 
     def _clearance(self, snapshot: ScannerState) -> NearestPair | None:
@@ -503,9 +517,12 @@ class TwinServer:
         wanted = self.hub.wanted("projection")
         if not wanted and frame.kind != "projection":
             return
-        now = self.clock.now()
+        job, now = self.jobs.current, self.live.now()
+        shown = now.sample if job is None or job.sample is None else job.sample
         shot = replace(
-            Shot.of(self.scanner, now),
+            now,
+            sample=shown,
+            revision=self.stage.revision(shown),
             positions=tuple(sorted(frame.positions.items())),
             camera=frame.camera,
             tube=TubeSettings(frame.kV, frame.power_W, frame.xrays_on),

@@ -10,14 +10,14 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from flexdt.protocol import RpcError, image
-from flexdt.protocol.methods.image_messages import Projection
-from flexdt.protocol.state_model import ImageFlags
+from flexdt.protocol.methods.image_messages import ImageOrigin, Projection
+from flexdt.protocol.state_model import ImageFlags, SamplePlacement
 from flexdt.runtime.log import log
 from flexdt.server.imaging.projections import TrueGeometry
 from flexdt.server.imaging.radiography import Radiography, flags_of
@@ -49,12 +49,40 @@ class Shot:
     sample: Sample
     tube: TubeSettings
     correction: NamedCorrection | None
+    revision: str | None = None
+    """Names the content of an uploaded sample."""
 
     @classmethod
-    def of(cls, scanner: ScannerTwin, now: float) -> Shot:
-        """The scanner at `now`."""
-        positions = tuple(sorted(scanner.positions(now).items()))
-        return cls(now, positions, scanner.camera, scanner.sample, scanner.tube, scanner.correction)
+    def of(cls, scanner: ScannerTwin, now: float, revision: str | None = None) -> Shot:
+        """The scanner at `now`, with the revision of the sample on its stage."""
+        return cls(
+            time=now,
+            positions=tuple(sorted(scanner.positions(now).items())),
+            camera=scanner.camera,
+            sample=scanner.sample,
+            tube=scanner.tube,
+            correction=scanner.correction,
+            revision=revision,
+        )
+
+    @property
+    def origin(self) -> ImageOrigin:
+        """What an image of it is made of, for the wire."""
+        sample, tube, camera = self.sample, self.tube, self.camera
+        return ImageOrigin(
+            sample=sample.name or None,
+            revision=self.revision,
+            material=sample.material,
+            offset=SamplePlacement(**asdict(sample.offset)),
+            lit=self.lit,
+            kV=tube.kV,
+            power_W=tube.power_W,
+            mode=camera.mode,
+            exposure_ms=camera.exposure_ms,
+            averages=camera.averages,
+            roi=camera.roi.edges,
+            correction=None if self.correction is None else self.correction.name,
+        )
 
     @property
     def lit(self) -> bool:
@@ -114,6 +142,7 @@ def image_of(
         kind=view.kind,
         time=shot.time,
         flags=flags_of(radiography, radiograph, shot.camera, shot.exposure, shot.time),
+        origin=shot.origin,
     )
 
 
@@ -124,6 +153,7 @@ class LiveView:
     Attributes:
         scanner, clock, hub, radiography: see their modules.
         quiet: whether a scan is making the images now (then this stays silent).
+        revision: names the content of an uploaded sample.
         turn: held while an image is made in a thread: the loop waits for one interpreter lock, not
             for those of a crowd.
     """
@@ -133,6 +163,7 @@ class LiveView:
     hub: Hub
     radiography: Radiography
     quiet: Callable[[], bool]
+    revision: Callable[[Sample], str | None] = lambda sample: None
     turn: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(1))
 
     def __post_init__(self) -> None:
@@ -149,6 +180,11 @@ class LiveView:
             self._last = None
         self._changed.set()
 
+    def now(self) -> Shot:
+        """What an image of this moment depends on."""
+        scanner = self.scanner
+        return Shot.of(scanner, self.clock.now(), self.revision(scanner.sample))
+
     async def run(self) -> None:
         """Publish until cancelled."""
         loop = asyncio.get_running_loop()
@@ -159,7 +195,7 @@ class LiveView:
                 begun = loop.time()
                 now = self.clock.now()
                 moving = self.scanner.rest_time(now) > now
-                shot = Shot.of(self.scanner, now)
+                shot = self.now()
                 if not shot.same_image(self._last):
                     try:
                         await self._show(shot)

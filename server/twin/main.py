@@ -40,6 +40,7 @@ async def run(options: TwinSettings) -> int:
     from flexdt.server.imaging.projections import load_truth
     from flexdt.server.imaging.projector_client import ProjectorClient
     from flexdt.server.imaging.projector_pool import ProjectorPool
+    from flexdt.server.imaging.projector_watch import ProjectorWatch
     from flexdt.server.network.tcp import serve
     from flexdt.server.scans.jobs import fresh_seed
     from flexdt.server.twin.application import TwinSession, twin_pages
@@ -69,6 +70,7 @@ async def run(options: TwinSettings) -> int:
         projectors=len(clients),
         memory_limit=options.memory_limit or memory_bytes() // 4,
         projector_room=projector.room,
+        projector_watch=ProjectorWatch(clients),
         limits=access.with_limits(
             options.limit, access.TwinLimits(), access.limit_names(access.ConnectionLimits())
         ),

@@ -115,7 +115,7 @@ export type JobStatus = {
   job: string; state: "queued" | "running" | "paused" | "done" | "failed" | "aborted" | "incomplete"; name: string;
   dataset: string | null; frames_done: number; frames_total: number; elapsed_s: number; remaining_s: number | null;
   time: number; speed_up: number | "max"; real_time_factor: number | null; error: Record<string, unknown> | null;
-  warnings: Array<string>; step: number | null; line: number | null; what: string
+  warnings: Array<string>; step: number | null; line: number | null; what: string; start: Record<string, number> | null
 };
 export type Jog = { axis: string; velocity: number; lease_s?: number };
 export type JsonValue = unknown;

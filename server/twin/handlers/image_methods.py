@@ -37,7 +37,7 @@ async def get_projection(twin: TwinServer, client: Client, params: p.ProjectionG
         RpcError: -32008, it would be larger than an answer may be.
         TwinError: a motor or a setting that the machine does not have.
     """
-    shot = Shot.of(twin.scanner, twin.clock.now())
+    shot = twin.live.now()
     elsewhere = any(x is not None for x in (params.positions, params.tube, params.camera))
     if elsewhere:
         shot = _as_though(twin, shot, params)

@@ -91,9 +91,9 @@ async def step(twin: TwinServer, client: h.Client, params: p.JobRef) -> w.JobSta
 
 @h.answers(p.JOB_ABORT)
 async def abort(twin: TwinServer, client: h.Client, params: p.JobAbort) -> w.JobStatus:
-    """The data set stays, marked incomplete, and says why."""
+    """Ends the job with X-rays off; its data set stays, marked incomplete, and says why."""
     job = twin.jobs.get(params.job)
-    twin.jobs.abort(job, params.reason)
+    twin.jobs.abort(job, params.reason, client.name)
     unsaved = ""
     try:
         await twin.keeper.flush()

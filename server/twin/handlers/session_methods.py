@@ -36,6 +36,7 @@ def hello(twin: TwinServer, client: Client, params: p.Hello) -> p.HelloResult:
         profile=twin.profile.name,
         session=client.name,
         physics=twin.radiography.physics,
+        instance=twin.instance,
     )
 
 

@@ -1,0 +1,90 @@
+"""Says why no image can be computed now, while somebody looks: no projector answers.
+
+Each projector is asked for its health again and again; one that computes answers as well. A refused
+or lost connection is known at once; a process that says nothing for `SILENT_S` does not answer.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Final, Protocol
+
+from flexdt.protocol import RpcError
+from flexdt.runtime.wire_errors import ProjectorUnavailable
+
+ASK_EVERY_S: Final = 0.4
+SILENT_S: Final = 1.2
+
+
+class Watched(Protocol):
+    """A projector's client, as far as it is watched."""
+
+    host: str
+    port: int
+
+    async def health(self) -> object:
+        """Ask for the projector's load.
+
+        Raises:
+            ProjectorUnavailable: it does not answer.
+        """
+
+
+@dataclass(eq=False, repr=False)
+class ProjectorWatch:
+    """Watches the projectors of one twin.
+
+    Attributes:
+        clients: of the projectors.
+        asks: whether somebody wants to know; nothing is asked before.
+        changed: called whenever `problem` has changed.
+        every_s: between an answer and the next question [s].
+        silent_s: after which a projector that is asked does not answer [s].
+        problem: why none answers, of the first one; None where any answers, or none was asked.
+    """
+
+    clients: Sequence[Watched]
+    asks: Callable[[], bool] = lambda: True
+    changed: Callable[[], None] = lambda: None
+    every_s: float = ASK_EVERY_S
+    silent_s: float = SILENT_S
+    problem: str | None = None
+    _problems: dict[Watched, str | None] = field(default_factory=dict)
+
+    async def run(self) -> None:
+        """Watch until cancelled."""
+        async with asyncio.TaskGroup() as group:
+            for client in self.clients:
+                group.create_task(self._watch(client))
+
+    async def _watch(self, client: Watched) -> None:
+        while True:
+            if self.asks():
+                await self._look(client)
+            await asyncio.sleep(self.every_s)
+
+    async def _look(self, client: Watched) -> None:
+        """Ask once, and wait for the answer however late; say so where it is late."""
+        asked = asyncio.ensure_future(client.health())
+        try:
+            if not (await asyncio.wait([asked], timeout=self.silent_s))[0]:
+                self._found(client, f"the projector at {client.host}:{client.port} does not answer")
+            await asked
+        except ProjectorUnavailable as error:
+            self._found(client, str(error))
+        except RpcError:  # an answer, too
+            self._found(client, None)
+        else:
+            self._found(client, None)
+        finally:
+            asked.cancel()
+
+    def _found(self, client: Watched, problem: str | None) -> None:
+        self._problems[client] = problem
+        known = [self._problems.get(each) for each in self.clients]
+        now = None if None in known else known[0]
+        if now != self.problem:
+            self.problem = now
+            self.changed()
