@@ -19,7 +19,10 @@ let due;
 export function rememberScript(text) {
     clearTimeout(due);
     due = window.setTimeout(async () => {
-        const packed = base64(await piped(text, new CompressionStream("deflate-raw"))).replace(/\+/g, "-").replace(/\//g, "_").replace(/=+$/, "");
+        const packed = base64(await piped(text, new CompressionStream("deflate-raw")))
+            .replace(/\+/g, "-")
+            .replace(/\//g, "_")
+            .replace(/=+$/, "");
         const url = new URL(location.href);
         url.hash = text && packed.length <= MOST ? `script=${packed}` : "";
         history.replaceState(null, "", url.hash ? url : url.href.replace(/#$/, ""));
@@ -29,7 +32,9 @@ export function rememberScript(text) {
             else
                 sessionStorage.removeItem(KEY);
         }
-        catch { /* it has no room */ }
+        catch {
+            /* it has no room */
+        }
     }, DUE_MS);
 }
 export async function rememberedScript() {

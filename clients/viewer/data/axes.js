@@ -4,18 +4,62 @@ import { call, command, emit, Failure, on, store } from "./link.js";
 const LEASE_S = 0.5, MOST_S = 10, RENEW_MS = 180, SETTLE_MS = 400;
 const GROUPS = [
     ["Source", "#ffb020", { ver_tube: "height", tra_tube: "sideways" }],
-    ["Sample", "#3aa0ff", { mag_obj: "to the detector", tra_obj: "sideways", ver_obj: "beam height" }],
+    [
+        "Sample",
+        "#3aa0ff",
+        { mag_obj: "to the detector", tra_obj: "sideways", ver_obj: "beam height" },
+    ],
     ["Detector", "#7a5cff", { mag_det: "distance", ver_det: "height", tra_det: "to the left" }],
 ];
 const TURN = { rot_obj: "turn of sample" }; // with what is set most
 const JOG_FALLBACK = { mm: 50, deg: 45 };
 const sod = (s) => s.geometry.SOD_mm, sdd = (s) => s.geometry.SDD_mm, high = () => store.framing?.sample_height_mm ?? NaN;
 const MAINS = [
-    { words: "Source to sample", unit: "mm", digits: 2, tip: "SOD: from the focal spot to the rotation axis, along the beam. Setting it moves the sample.", now: sod, axes: ["mag_obj"], shift: (s, v) => v - sod(s) },
-    { words: "Source to detector", unit: "mm", digits: 2, tip: "SDD: from the focal spot to the panel. Setting it moves the detector.", now: sdd, axes: ["mag_det"], shift: (s, v) => v - sdd(s) },
-    { words: "Magnification", unit: "×", digits: 3, tip: "How much larger the sample is on the panel: SDD / SOD. Setting it moves the sample.", now: (s) => s.geometry.magnification, axes: ["mag_obj"], shift: (s, v) => sdd(s) / v - sod(s) },
-    { words: "Voxel size", unit: "µm", digits: 2, tip: "A pixel of the image, as large as it is at the sample: pixel / magnification. Setting it moves the sample.", now: (s) => 1000 * s.geometry.voxel_size_mm, axes: ["mag_obj"], shift: (s, v) => sod(s) * (v / (1000 * s.geometry.voxel_size_mm) - 1) },
-    { words: "Sample above beam", unit: "mm", digits: 2, tip: "Height of the sample's reference point above the focal spot. Setting it moves source and detector together.", now: high, axes: ["ver_tube", "ver_det"], shift: (_, v) => high() - v },
+    {
+        words: "Source to sample",
+        unit: "mm",
+        digits: 2,
+        tip: "SOD: from the focal spot to the rotation axis, along the beam. Setting it moves the sample.",
+        now: sod,
+        axes: ["mag_obj"],
+        shift: (s, v) => v - sod(s),
+    },
+    {
+        words: "Source to detector",
+        unit: "mm",
+        digits: 2,
+        tip: "SDD: from the focal spot to the panel. Setting it moves the detector.",
+        now: sdd,
+        axes: ["mag_det"],
+        shift: (s, v) => v - sdd(s),
+    },
+    {
+        words: "Magnification",
+        unit: "×",
+        digits: 3,
+        tip: "How much larger the sample is on the panel: SDD / SOD. Setting it moves the sample.",
+        now: (s) => s.geometry.magnification,
+        axes: ["mag_obj"],
+        shift: (s, v) => sdd(s) / v - sod(s),
+    },
+    {
+        words: "Voxel size",
+        unit: "µm",
+        digits: 2,
+        tip: "A pixel of the image, as large as it is at the sample: pixel / magnification. Setting it moves the sample.",
+        now: (s) => 1000 * s.geometry.voxel_size_mm,
+        axes: ["mag_obj"],
+        shift: (s, v) => sod(s) * (v / (1000 * s.geometry.voxel_size_mm) - 1),
+    },
+    {
+        words: "Sample above beam",
+        unit: "mm",
+        digits: 2,
+        tip: "Height of the sample's reference point above the focal spot. Setting it moves source and detector together.",
+        now: high,
+        axes: ["ver_tube", "ver_det"],
+        shift: (_, v) => high() - v,
+    },
 ];
 const mains = [];
 const rows = new Map();
@@ -52,11 +96,15 @@ export function jogStop(token) {
     if (hold)
         void command("axes.jog", { axis: hold.axis, velocity: 0 }, `Cannot stop ${hold.axis}`);
 }
-export function jogStopAll() { for (const token of [...held.keys()])
-    jogStop(token); }
+export function jogStopAll() {
+    for (const token of [...held.keys()])
+        jogStop(token);
+}
 // What came of a refused move, in a few words.
 function title(axis, error) {
-    const halts = (error instanceof Failure ? error.data?.halts_at : null) ?? {};
+    const halts = (error instanceof Failure
+        ? error.data?.halts_at
+        : null) ?? {};
     if (axis in halts)
         return `${axis} goes to ${fixed(halts[axis], 2)} and halts there`;
     return Object.keys(halts).length ? `${axis} halts on its way` : `${axis} does not move`;
@@ -85,10 +133,14 @@ function mainRow(main, state) {
         const by = shift(s, value);
         void send(Object.fromEntries(axes.map((name) => [name, s.axes[name].position + by])));
     }
-    input.addEventListener("blur", () => { if (store.state)
-        drawMains(store.state); });
+    input.addEventListener("blur", () => {
+        if (store.state)
+            drawMains(store.state);
+    });
     mains.push([main, input]);
-    return [el("div", { class: "main-row" }, term(words, tip), el("span", {}, input, el("span", { class: "unit" }, unit)))];
+    return [
+        el("div", { class: "main-row" }, term(words, tip), el("span", {}, input, el("span", { class: "unit" }, unit))),
+    ];
 }
 function drawMains(state) {
     for (const [{ now, digits }, input] of mains) {
@@ -102,14 +154,32 @@ function drawMains(state) {
 }
 function jogButton(axis, direction, sign) {
     const token = `${axis}:${direction}`;
-    const button = el("button", { "data-jog": token, title: `Hold to jog ${axis} (or hold Enter)`, "aria-label": `jog ${axis} ${direction > 0 ? "up" : "down"}` }, sign);
-    const stop = () => { button.classList.remove("held"); jogStop(token); };
-    const start = () => { button.classList.add("held"); jogStart(axis, direction, token); };
-    button.addEventListener("pointerdown", (e) => { e.preventDefault(); button.setPointerCapture(e.pointerId); start(); });
-    button.addEventListener("keydown", (e) => { if (e.key === "Enter" && !e.repeat)
-        start(); });
-    button.addEventListener("keyup", (e) => { if (e.key === "Enter")
-        stop(); });
+    const button = el("button", {
+        "data-jog": token,
+        title: `Hold to jog ${axis} (or hold Enter)`,
+        "aria-label": `jog ${axis} ${direction > 0 ? "up" : "down"}`,
+    }, sign);
+    const stop = () => {
+        button.classList.remove("held");
+        jogStop(token);
+    };
+    const start = () => {
+        button.classList.add("held");
+        jogStart(axis, direction, token);
+    };
+    button.addEventListener("pointerdown", (e) => {
+        e.preventDefault();
+        button.setPointerCapture(e.pointerId);
+        start();
+    });
+    button.addEventListener("keydown", (e) => {
+        if (e.key === "Enter" && !e.repeat)
+            start();
+    });
+    button.addEventListener("keyup", (e) => {
+        if (e.key === "Enter")
+            stop();
+    });
     for (const name of ["pointerup", "pointercancel", "lostpointercapture", "blur"])
         button.addEventListener(name, stop);
     return button;
@@ -120,21 +190,49 @@ function build(state) {
     box.textContent = "";
     rows.clear();
     mains.length = 0;
-    const turn = Object.entries(TURN).filter(([name]) => name in state.axes).map(([name, what]) => axisRow(name, state.axes[name], what));
+    const turn = Object.entries(TURN)
+        .filter(([name]) => name in state.axes)
+        .map(([name, what]) => axisRow(name, state.axes[name], what));
     $("#mains").replaceChildren(...MAINS.flatMap((main) => mainRow(main, state)), ...turn);
-    for (const [title, tint, axes] of [...GROUPS, ["Others", "#999", Object.fromEntries(others.map((name) => [name, ""]))]]) {
-        const found = Object.entries(axes).filter(([name]) => name in state.axes).map(([name, what]) => axisRow(name, state.axes[name], what));
+    for (const [title, tint, axes] of [
+        ...GROUPS,
+        ["Others", "#999", Object.fromEntries(others.map((name) => [name, ""]))],
+    ]) {
+        const found = Object.entries(axes)
+            .filter(([name]) => name in state.axes)
+            .map(([name, what]) => axisRow(name, state.axes[name], what));
         if (found.length)
             box.append(el("div", { class: "group", style: `--tint:${tint}` }, el("h2", {}, title), ...found));
     }
 }
 function axisRow(name, axis, what) {
     const [low, high] = axis.limits;
-    const slider = el("input", { type: "range", min: low, max: high, step: 0.1, value: axis.target, "aria-label": `${name} slider` });
+    const slider = el("input", {
+        type: "range",
+        min: low,
+        max: high,
+        step: 0.1,
+        value: axis.target,
+        "aria-label": `${name} slider`,
+    });
     const number = field({ "aria-label": `${name} value` }, enter, () => number.blur());
     const now = el("span", { class: "now" });
     const box = el("div", { class: "axis", "data-axis": name });
-    const row = { name, box, slider, number, now, low, high, from: low, to: high, turn: NaN, dragging: false, asked: 0, waiting: 0 };
+    const row = {
+        name,
+        box,
+        slider,
+        number,
+        now,
+        low,
+        high,
+        from: low,
+        to: high,
+        turn: NaN,
+        dragging: false,
+        asked: 0,
+        waiting: 0,
+    };
     function enter() {
         const text = number.value, value = parsed(text);
         number.blur();
@@ -144,19 +242,28 @@ function axisRow(name, axis, what) {
             emit("note", "error", `${name} does not move`, `“${text}” is not a number`);
     }
     number.addEventListener("blur", () => draw(row));
-    const letGo = () => setTimeout(() => { row.dragging = false; draw(row); }); // after the change, if there is one
-    slider.addEventListener("input", () => { row.dragging = true; number.value = fixed(Number(slider.value), 3); number.classList.add("typed"); });
+    const letGo = () => setTimeout(() => {
+        row.dragging = false;
+        draw(row);
+    }); // after the change, if there is one
+    slider.addEventListener("input", () => {
+        row.dragging = true;
+        number.value = fixed(Number(slider.value), 3);
+        number.classList.add("typed");
+    });
     for (const event of ["pointerup", "pointercancel", "blur"])
         slider.addEventListener(event, letGo);
     const slid = async () => {
         row.dragging = false;
-        const mine = row.waiting = ++row.asked;
+        const mine = (row.waiting = ++row.asked);
         // The state that shows the motion may come a little after the answer.
         const wait = (await move(name, Number(slider.value))) ? SETTLE_MS : 0;
-        setTimeout(() => { if (row.waiting === mine) {
-            row.waiting = 0;
-            draw(row);
-        } }, wait);
+        setTimeout(() => {
+            if (row.waiting === mine) {
+                row.waiting = 0;
+                draw(row);
+            }
+        }, wait);
     };
     slider.addEventListener("change", () => void slid());
     box.append(el("div", { class: "top" }, el("span", { title: what }, el("span", { class: "name" }, name), el("span", { class: "what" }, what)), el("span", {}, number, el("span", { class: "unit" }, axis.unit === "deg" ? "°" : "mm"))), el("div", { class: "line" }, jogButton(name, -1, "−"), el("div", { class: "track" }, slider, now), jogButton(name, 1, "+")));
@@ -166,9 +273,15 @@ function axisRow(name, axis, what) {
 // What the chosen speed is of those axes.
 function pace(state) {
     const of = (unit) => {
-        const all = Object.values(state.axes).filter((a) => a.unit === unit && !a.virtual).map((a) => (a.speed ?? JOG_FALLBACK[unit]) * Number($select("#jog-speed").value));
+        const all = Object.values(state.axes)
+            .filter((a) => a.unit === unit && !a.virtual)
+            .map((a) => (a.speed ?? JOG_FALLBACK[unit]) * Number($select("#jog-speed").value));
         const low = Math.min(...all), high = Math.max(...all);
-        return all.length ? [`${low === high ? fixed(low, 1) : `${fixed(low, 1)} to ${fixed(high, 1)}`} ${unit === "deg" ? "°/s" : "mm/s"}`] : [];
+        return all.length
+            ? [
+                `${low === high ? fixed(low, 1) : `${fixed(low, 1)} to ${fixed(high, 1)}`} ${unit === "deg" ? "°/s" : "mm/s"}`,
+            ]
+            : [];
     };
     setText($("#jog-is"), [...of("mm"), ...of("deg")].join(", "));
 }
@@ -215,6 +328,8 @@ function draw(row) {
     row.box.classList.toggle("limit", !axis.moving && (axis.position - row.low < 0.5 || row.high - axis.position < 0.5));
 }
 on("state", refresh);
-on("connection", () => { if (!store.viewer || !store.twin)
-    for (const token of [...held.keys()])
-        drop(token); });
+on("connection", () => {
+    if (!store.viewer || !store.twin)
+        for (const token of [...held.keys()])
+            drop(token);
+});

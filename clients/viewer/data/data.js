@@ -1,5 +1,5 @@
 // The Data tab: a browser of data sets; one that is open goes through its images, radiograph and machine together.
-import { $, $$, $button, $dialog, $input, $select, clicks, el, fixed, putImage, seconds, setText, slid, within, words } from "./dom.js";
+import { $, $$, $button, $dialog, $input, $select, clicks, el, fixed, putImage, seconds, setText, slid, within, words, } from "./dom.js";
 import { call, command, emit, on, store } from "./link.js";
 import { asked, remember } from "./address.js";
 import { draw as drawTimeline } from "./timeline.js";
@@ -7,39 +7,92 @@ import { offer } from "./share.js";
 import * as compare from "./compare.js";
 import * as marks from "./marks.js";
 const SEARCH_MS = 250, AGAIN_MS = 500, PLAYED = 300, LEAST_MS = 60, LEAST_PX = 76;
-const WORDS = { complete: "complete", incomplete: "incomplete", running: "running", unknown: "cannot be read in full" };
+const WORDS = {
+    complete: "complete",
+    incomplete: "incomplete",
+    running: "running",
+    unknown: "cannot be read in full",
+};
 let listed = [], told = null, plan = null, index = 0, next = null, asking = false, playing = false, number = 0;
 const search = $input("#data-search");
 clicks({ "data-more": () => list(listed.length) });
-const slider = el("input", { type: "range", id: "record-frame", min: 0, step: 1, value: 0, "aria-label": "Image", oninput: () => show(Number(slider.value)) });
-const canvas = el("canvas", { id: "record-line", role: "img", "aria-label": "Motors, clearance and counts over time" });
+const slider = el("input", {
+    type: "range",
+    id: "record-frame",
+    min: 0,
+    step: 1,
+    value: 0,
+    "aria-label": "Image",
+    oninput: () => show(Number(slider.value)),
+});
+const canvas = el("canvas", {
+    id: "record-line",
+    role: "img",
+    "aria-label": "Motors, clearance and counts over time",
+});
 const button = (id, text, title, f) => el("button", { id, class: "small", title, onclick: f }, text);
-const panel = el("div", { id: "record", hidden: true }, el("div", { class: "row head" }, el("b", { id: "record-name", class: "cut" }), el("span", { id: "record-state", class: "muted cut" }), el("span", { class: "spacer" }), button("record-fit", "Calibrate", "Calibrate from this data set: its sample is the phantom", () => { if (told)
-    emit("calibrate", told.info.name, told.info.sample); }), button("record-align", "Align", "Find the axis of this scan without a phantom", () => { if (told)
-    emit("align", told.info.name); }), button("record-volume", "Reconstruct", "Its volume, as flexdt reconstruct makes it", () => { if (told)
-    emit("reconstruct", told.info.name); }), button("record-script", "Script", "Bring its script into the Scan tab", script), button("record-replay", "Replay file", "This scan as one HTML file that plays it", () => offer("viewer.export", { format: "html", replay: true }, "No replay")), button("record-close", "Close", "Back to what is live (Escape)", () => open(null, null, true))), el("div", { class: "row head" }, button("record-play", "▶", "Play", () => play(!playing)), button("record-back", "‹", "The image before", () => show(index - 1)), slider, button("record-next", "›", "The next image", () => show(index + 1)), el("span", { id: "record-at", class: "mono small-text cut" })), compare.row, marks.row((all) => { if (told)
-    emit("calibrate", told.info.name, told.info.sample, all); }), el("div", { class: "lanes", tabIndex: 0, role: "group", "aria-label": "Motors, clearance and counts" }, canvas), el("div", { id: "record-note", class: "muted small-text cut" }));
+const panel = el("div", { id: "record", hidden: true }, el("div", { class: "row head" }, el("b", { id: "record-name", class: "cut" }), el("span", { id: "record-state", class: "muted cut" }), el("span", { class: "spacer" }), button("record-fit", "Calibrate", "Calibrate from this data set: its sample is the phantom", () => {
+    if (told)
+        emit("calibrate", told.info.name, told.info.sample);
+}), button("record-align", "Align", "Find the axis of this scan without a phantom", () => {
+    if (told)
+        emit("align", told.info.name);
+}), button("record-volume", "Reconstruct", "Its volume, as flexdt reconstruct makes it", () => {
+    if (told)
+        emit("reconstruct", told.info.name);
+}), button("record-script", "Script", "Bring its script into the Scan tab", script), button("record-replay", "Replay file", "This scan as one HTML file that plays it", () => offer("viewer.export", { format: "html", replay: true }, "No replay")), button("record-close", "Close", "Back to what is live (Escape)", () => open(null, null, true))), el("div", { class: "row head" }, button("record-play", "▶", "Play", () => play(!playing)), button("record-back", "‹", "The image before", () => show(index - 1)), slider, button("record-next", "›", "The next image", () => show(index + 1)), el("span", { id: "record-at", class: "mono small-text cut" })), compare.row, marks.row((all) => {
+    if (told)
+        emit("calibrate", told.info.name, told.info.sample, all);
+}), el("div", {
+    class: "lanes",
+    tabIndex: 0,
+    role: "group",
+    "aria-label": "Motors, clearance and counts",
+}, canvas), el("div", { id: "record-note", class: "muted small-text cut" }));
 $("#stage").append(panel);
 // Thumbnails come as 8-bit grey.
 function thumbnail(small) {
     const c = el("canvas", { width: 1, height: 1 });
     return small ? putImage(c, small) : c;
 }
-const dated = (info) => (info.started ? info.started.slice(0, 16).replace("T", " ") : new Date(1000 * info.modified).toISOString().slice(0, 16).replace("T", " "));
+const dated = (info) => info.started
+    ? info.started.slice(0, 16).replace("T", " ")
+    : new Date(1000 * info.modified).toISOString().slice(0, 16).replace("T", " ");
 function settings(info) {
-    const frames = info.present < info.projections ? `${info.present} of ${info.projections} projections` : `${info.projections} projections`;
+    const frames = info.present < info.projections
+        ? `${info.present} of ${info.projections} projections`
+        : `${info.projections} projections`;
     const beam = info.kV === null ? null : `${fixed(info.kV, 0)} kV ${fixed(info.power_W, 0)} W`;
-    return [frames, beam, info.exposure_ms === null ? null : `${fixed(info.exposure_ms, 0)} ms`, info.sample || null].filter(Boolean).join(" · ");
+    return [
+        frames,
+        beam,
+        info.exposure_ms === null ? null : `${fixed(info.exposure_ms, 0)} ms`,
+        info.sample || null,
+    ]
+        .filter(Boolean)
+        .join(" · ");
 }
 function row(info) {
     const why = info.problem || info.reason;
-    const node = el("button", { class: "data-set", "data-name": info.name, title: why, onclick: () => open(info.name, null, true) }, thumbnail(info.thumbnail), el("span", {}, el("b", {}, info.name), el("span", { class: "muted" }, dated(info)), el("span", {}, settings(info)), el("span", { class: `state ${info.state}` }, info.state === "incomplete" && why ? `incomplete: ${why}` : info.state === "unknown" && why ? why : WORDS[info.state])));
+    const node = el("button", {
+        class: "data-set",
+        "data-name": info.name,
+        title: why,
+        onclick: () => open(info.name, null, true),
+    }, thumbnail(info.thumbnail), el("span", {}, el("b", {}, info.name), el("span", { class: "muted" }, dated(info)), el("span", {}, settings(info)), el("span", { class: `state ${info.state}` }, info.state === "incomplete" && why
+        ? `incomplete: ${why}`
+        : info.state === "unknown" && why
+            ? why
+            : WORDS[info.state])));
     node.setAttribute("aria-current", String(info.name === told?.info.name));
     return node;
 }
 async function list(start = 0) {
     const mine = ++number;
-    const answer = await call("viewer.datasets", { search: search.value.trim().slice(0, 200), start }).catch(words);
+    const answer = await call("viewer.datasets", {
+        search: search.value.trim().slice(0, 200),
+        start,
+    }).catch(words);
     if (mine !== number)
         return;
     if (typeof answer === "string") {
@@ -56,22 +109,33 @@ async function list(start = 0) {
     const none = search.value ? "none is found" : "none yet: run a scan", all = answer.total ? `${listed.length} of ${answer.total}${left}` : none;
     setText($("#data-count"), answer.unread ? `${answer.total} data sets · reading ${answer.unread} more …` : all);
     if (answer.unread && !$("#tab-data").hidden)
-        setTimeout(() => { if (mine === number)
-            void list(); }, AGAIN_MS);
+        setTimeout(() => {
+            if (mine === number)
+                void list();
+        }, AGAIN_MS);
 }
 let typing, drawn = "";
-function listSoon() { clearTimeout(typing); typing = window.setTimeout(list, SEARCH_MS); }
+function listSoon() {
+    clearTimeout(typing);
+    typing = window.setTimeout(list, SEARCH_MS);
+}
 search.addEventListener("input", listSoon);
-on("tab", (tab) => { if (tab === "data" && store.session)
-    void list(); });
-on("session", () => { if (!$("#tab-data").hidden)
-    void list(); });
+on("tab", (tab) => {
+    if (tab === "data" && store.session)
+        void list();
+});
+on("session", () => {
+    if (!$("#tab-data").hidden)
+        void list();
+});
 export const folder = (job) => (job?.dataset ?? "").split(/[\\/]/).pop() || "?";
 on("job", (job) => {
     if (!$("#tab-data").hidden)
         listSoon();
     // Open while it was scanned: now it has more images, or all.
-    if (told?.info.state === "running" && folder(job) === told.info.name && !["queued", "running", "paused"].includes(job.state))
+    if (told?.info.state === "running" &&
+        folder(job) === told.info.name &&
+        !["queued", "running", "paused"].includes(job.state))
         void open(told.info.name, index);
 });
 // Opens a data set at an image, or closes the one that is open (null).
@@ -79,7 +143,9 @@ export async function open(name, at = null, step = false) {
     void play(false);
     next = null;
     const mine = ++opening;
-    const answer = name === null ? await call("viewer.recorded", { name }).catch(() => null) : await command("viewer.recorded", { name }, `${name} cannot be opened`);
+    const answer = name === null
+        ? await call("viewer.recorded", { name }).catch(() => null)
+        : await command("viewer.recorded", { name }, `${name} cannot be opened`);
     if (mine !== opening || (name !== null && !answer))
         return;
     told = name === null ? null : answer;
@@ -125,12 +191,18 @@ function note() {
         parts.push("another machine or other zeros than this twin's: its pose is not drawn in the scene");
     if (compare.how() !== "recorded") {
         const { sample, correction } = store.state ?? {};
-        const other = sample?.name === told.info.sample ? "" : ` (the scan says ${told.info.sample || "nothing of its sample"})`;
+        const other = sample?.name === told.info.sample
+            ? ""
+            : ` (the scan says ${told.info.sample || "nothing of its sample"})`;
         parts.push(`virtual: ${sample?.name || "empty stage"}${other}, ${correction ? `correction ${correction.name}` : "nominal geometry"}`);
     }
     if (told.clearance_of)
         parts.push(`clearance: ${told.clearance_of}`);
-    parts.push(told.counts === null ? "measuring counts and clearances …" : told.counts.some((c) => c === null) ? "gaps: images that cannot be read" : "");
+    parts.push(told.counts === null
+        ? "measuring counts and clearances …"
+        : told.counts.some((c) => c === null)
+            ? "gaps: images that cannot be read"
+            : "");
     return parts.filter(Boolean).join(" · ");
 }
 function lanes() {
@@ -152,7 +224,14 @@ function lanes() {
         curves["mean counts"] = told.counts;
         units["mean counts"] = "";
     }
-    plan = { duration_s: times.at(-1) ?? 0, times, curves, units, images: times.map((t, k) => [t, kinds[k]]), axis: told.times_s ? "s" : "" };
+    plan = {
+        duration_s: times.at(-1) ?? 0,
+        times,
+        curves,
+        units,
+        images: times.map((t, k) => [t, kinds[k]]),
+        axis: told.times_s ? "s" : "",
+    };
     redraw();
 }
 let moment = null, kept;
@@ -183,7 +262,11 @@ async function show(wanted) {
         const kind = k >= 0 && kinds.kinds[k] !== "projection" ? "counts" : kindAsked();
         let about = null, why = "";
         try {
-            about = await call("viewer.recorded_image", { index: at, kind, virtual: compare.how() !== "recorded" });
+            about = await call("viewer.recorded_image", {
+                index: at,
+                kind,
+                virtual: compare.how() !== "recorded",
+            });
         }
         catch (error) {
             why = words(error);
@@ -192,7 +275,7 @@ async function show(wanted) {
         }
         if (!still(name))
             break;
-        moment = about ? about.time_s ?? at : told.times_s ? null : at;
+        moment = about ? (about.time_s ?? at) : told.times_s ? null : at;
         store.hidden = !about;
         if (!about) {
             store.image = null;
@@ -200,8 +283,13 @@ async function show(wanted) {
         }
         panel.dataset.index = String(at);
         panel.dataset.shown = String(Boolean(about));
-        const facts = about && [about.file, about.time_s === null ? "" : `${fixed(about.time_s, 2)} s`, about.image === "projection" ? "" : about.image,
-            why && `counts: ${why}`, about.problem && `no virtual image: ${about.problem}`];
+        const facts = about && [
+            about.file,
+            about.time_s === null ? "" : `${fixed(about.time_s, 2)} s`,
+            about.image === "projection" ? "" : about.image,
+            why && `counts: ${why}`,
+            about.problem && `no virtual image: ${about.problem}`,
+        ];
         setText($("#record-at"), [`image ${at + 1} of ${told.images}`, ...(facts ?? [why])].filter(Boolean).join(" · "));
         $("#record-at").title = $("#record-at").textContent;
         redraw();
@@ -212,8 +300,10 @@ async function show(wanted) {
         return;
     }
     clearTimeout(kept);
-    kept = window.setTimeout(() => { if (told)
-        remember({ frame: index }); }, SEARCH_MS);
+    kept = window.setTimeout(() => {
+        if (told)
+            remember({ frame: index });
+    }, SEARCH_MS);
 }
 async function play(on) {
     playing = on;
@@ -241,10 +331,12 @@ async function script() {
 }
 // The virtual image goes with what the twin has in force.
 let force = "";
-const anew = () => { if (told) {
-    setText($("#record-note"), note());
-    void show(index);
-} };
+const anew = () => {
+    if (told) {
+        setText($("#record-note"), note());
+        void show(index);
+    }
+};
 on("compare", anew);
 on("state", ({ sample, correction }) => {
     const now = JSON.stringify([sample, correction?.name]);
@@ -262,11 +354,18 @@ slid(canvas, (part) => {
 });
 slider.addEventListener("pointerdown", () => void play(false));
 new ResizeObserver(redraw).observe(panel);
-new MutationObserver(redraw).observe(document.documentElement, { attributeFilter: ["data-theme"] });
-$select("#kind").addEventListener("change", () => { if (told)
-    void show(index); });
+new MutationObserver(redraw).observe(document.documentElement, {
+    attributeFilter: ["data-theme"],
+});
+$select("#kind").addEventListener("change", () => {
+    if (told)
+        void show(index);
+});
 window.addEventListener("keydown", (e) => {
-    if (e.key !== "Escape" || panel.hidden || $dialog("#help-dialog").open || within(e.target, "input[type=text], textarea, select"))
+    if (e.key !== "Escape" ||
+        panel.hidden ||
+        $dialog("#help-dialog").open ||
+        within(e.target, "input[type=text], textarea, select"))
         return;
     void open(null, null, true);
 });
@@ -285,8 +384,14 @@ function ready() {
         void open(told.info.name, index);
     }
 }
-on("open", () => { seen = false; lost = told !== null; });
-on("layers", () => { seen = true; ready(); });
+on("open", () => {
+    seen = false;
+    lost = told !== null;
+});
+on("layers", () => {
+    seen = true;
+    ready();
+});
 on("session", ready);
 export function restore() {
     const name = asked("data"), at = asked("frame") === null ? null : Number(asked("frame")) || 0;

@@ -1,21 +1,50 @@
 // The scan designer: bars for voxel, tube, exposure and images; what a scan with them will look like. A change of a bar
 // rewrites the script, unless somebody else's stands there.
-import { $input, $select, bars, bytes, cleared, el, fixed, seconds, setText, words } from "./dom.js";
+import { $input, $select, bars, bytes, cleared, el, fixed, seconds, setText, words, } from "./dom.js";
 import { call, emit, on, store } from "./link.js";
 const SETTLE_MS = 400, LATEST = 1.02;
-const BARS = [["voxel_um", "voxel", "µm", 1], ["kV", "voltage", "kV", 0], ["power_W", "power", "W", 0], ["exposure_ms", "exposure", "ms", 0], ["frames", "images", "", 0]];
+const BARS = [
+    ["voxel_um", "voxel", "µm", 1],
+    ["kV", "voltage", "kV", 0],
+    ["power_W", "power", "W", 0],
+    ["exposure_ms", "exposure", "ms", 0],
+    ["frames", "images", "", 0],
+];
 const scales = {}, inputs = {};
 const row = ([name, words, unit, digits]) => {
     const out = el("output", { id: `design-${name}-is`, class: "mono" });
     const say = () => setText(out, `${fixed(value(name), digits)} ${unit}`);
-    inputs[name] = el("input", { type: "range", id: `design-${name}`, min: 0, max: 1000, step: "any", oninput: say, onchange: changed });
-    return [el("label", { class: "muted", htmlFor: `design-${name}` }, words), el("span", { class: "row" }, inputs[name], out)];
+    inputs[name] = el("input", {
+        type: "range",
+        id: `design-${name}`,
+        min: 0,
+        max: 1000,
+        step: "any",
+        oninput: say,
+        onchange: changed,
+    });
+    return [
+        el("label", { class: "muted", htmlFor: `design-${name}` }, words),
+        el("span", { class: "row" }, inputs[name], out),
+    ];
 };
-const word = (id, label, start, title) => [el("label", { class: "muted", htmlFor: id, title }, label), el("input", { type: "text", id, value: start, title, onchange: changed })];
+const word = (id, label, start, title) => [
+    el("label", { class: "muted", htmlFor: id, title }, label),
+    el("input", { type: "text", id, value: start, title, onchange: changed }),
+];
 const facts = el("div", { id: "design-facts", class: "small-text", "aria-live": "polite" });
-const chart = el("canvas", { id: "design-chart", role: "img", "aria-label": "Predicted histogram of transmission" });
-const card = el("details", { id: "designer", ontoggle: () => { if (card.open)
-        void begin(); } }, el("summary", {}, "Design a scan"), el("div", { class: "form" }, ...BARS.flatMap(row), ...word("design-filter", "filter", "", "MATERIAL:MM beside the machine’s own, put there by hand: aluminium:1"), ...word("design-detail", "detail", "void:0.5", "What is to be seen on the darkest ray: MATERIAL:MM or void:MM"), ...word("design-cnr", "CNR wanted", "5", "Contrast to noise of the detail that is wished for")), chart, facts);
+const chart = el("canvas", {
+    id: "design-chart",
+    role: "img",
+    "aria-label": "Predicted histogram of transmission",
+});
+const card = el("details", {
+    id: "designer",
+    ontoggle: () => {
+        if (card.open)
+            void begin();
+    },
+}, el("summary", {}, "Design a scan"), el("div", { class: "form" }, ...BARS.flatMap(row), ...word("design-filter", "filter", "", "MATERIAL:MM beside the machine’s own, put there by hand: aluminium:1"), ...word("design-detail", "detail", "void:0.5", "What is to be seen on the darkest ray: MATERIAL:MM or void:MM"), ...word("design-cnr", "CNR wanted", "5", "Contrast to noise of the detail that is wished for")), chart, facts);
 export const place = (node) => node.append(card);
 export function value(name) {
     const [low, high, log] = scales[name] ?? [0, 1, false], t = Number(inputs[name].value) / 1000;
@@ -29,7 +58,7 @@ function put(name, v) {
 }
 // What a script is to have; nothing while the designer is closed.
 const wished = () => Object.fromEntries(BARS.map(([name]) => [name, value(name)]));
-export const wish = () => (card.open && scales.kV ? wished() : {});
+export const wish = () => card.open && scales.kV ? wished() : {};
 async function begin() {
     if (scales.kV || !store.state)
         return;
@@ -37,8 +66,18 @@ async function begin() {
     const limits = await call("viewer.spectrum", { kV: tube.kV }).then((s) => s.limits, () => null);
     if (!limits)
         return;
-    Object.assign(scales, { kV: [...limits.kV, false], power_W: [1, limits.power_W[1], false], exposure_ms: [...limits.exposure_ms, true], frames: [2, 3600, true] });
-    const start = { kV: tube.kV, power_W: tube.power_W, exposure_ms: camera.exposure_ms, frames: $input("#wish-frames").valueAsNumber || 361 };
+    Object.assign(scales, {
+        kV: [...limits.kV, false],
+        power_W: [1, limits.power_W[1], false],
+        exposure_ms: [...limits.exposure_ms, true],
+        frames: [2, 3600, true],
+    });
+    const start = {
+        kV: tube.kV,
+        power_W: tube.power_W,
+        exposure_ms: camera.exposure_ms,
+        frames: $input("#wish-frames").valueAsNumber || 361,
+    };
     for (const [name, v] of Object.entries(start))
         put(name, v);
     scaleVoxels();
@@ -59,15 +98,28 @@ function changed() {
     $input("#wish-frames").value = String(value("frames"));
     $input("#wish-exposure").value = String(value("exposure_ms"));
     clearTimeout(due);
-    due = window.setTimeout(() => { emit("design"); void predict(); }, SETTLE_MS);
+    due = window.setTimeout(() => {
+        emit("design");
+        void predict();
+    }, SETTLE_MS);
 }
 async function predict() {
     if (!store.state)
         return;
     const mine = ++number, { geometry: g, camera, sample } = store.state, w = wished();
     setText(facts, `predicting a scan of ${sample.name || "nothing"} …`);
-    const asked = { kV: w.kV, power_W: w.power_W, exposure_ms: w.exposure_ms, frames: w.frames, kind: $select("#wish-kind").value, averages: 1, filter: $input("#design-filter").value.trim(), detail: $input("#design-detail").value.trim(),
-        sdd_mm: Number(g.SDD_mm.toFixed(4)), sod_mm: Number(((w.voxel_um / 1000 / camera.pixel_mm) * g.SDD_mm).toFixed(4)) };
+    const asked = {
+        kV: w.kV,
+        power_W: w.power_W,
+        exposure_ms: w.exposure_ms,
+        frames: w.frames,
+        kind: $select("#wish-kind").value,
+        averages: 1,
+        filter: $input("#design-filter").value.trim(),
+        detail: $input("#design-detail").value.trim(),
+        sdd_mm: Number(g.SDD_mm.toFixed(4)),
+        sod_mm: Number(((w.voxel_um / 1000 / camera.pixel_mm) * g.SDD_mm).toFixed(4)),
+    };
     let p;
     try {
         p = await call("exposure.predict", asked);
@@ -85,14 +137,29 @@ async function predict() {
     const part = (v) => `${fixed(100 * v, v && v < 0.1 ? 1 : 0)} %`, line = (id, ...nodes) => el("div", { id: `design-${id}` }, ...nodes);
     // Noise of photons goes with the root of the time, what the panel adds falls faster.
     const other = best && (best.kV !== w.kV || best.filter !== p.asked.filter);
-    const reach = { class: "small", id: "design-reach", onclick: () => { put("exposure_ms", ms); changed(); } };
-    facts.replaceChildren(line("time", `${seconds(p.seconds)} · ${bytes(p.bytes)} · ${fixed(p.asked.kerma_mGy, 2)} mGy on the axis`), line("least", `least transmission ${part(p.transmission.least)} · saturated ${part(p.saturated)} · starved ${part(p.starved)}`), line("quality", `contrast to noise of ${p.detail}: `, el("b", { class: `verdict ${enough ? "ok" : "bad"}` }, p.asked.cnr === null ? "saturated" : fixed(cnr, 2)), " ", enough || !(goal > 0) || p.asked.cnr === null ? null : ms <= (scales.exposure_ms?.[1] ?? 0) ? el("button", reach, `${fixed(goal, 1)} takes ${fixed(Math.ceil(ms), 0)} ms at most`) : `no exposure reaches ${fixed(goal, 1)}`), line("best", other ? `best at ${fixed(best.kV, 0)} kV${best.filter ? `, ${best.filter}` : ""}: ${fixed(best.cnr ?? 0, 2)}` : "", ...p.assumed.map((a) => ` · ${a}`)));
+    const reach = {
+        class: "small",
+        id: "design-reach",
+        onclick: () => {
+            put("exposure_ms", ms);
+            changed();
+        },
+    };
+    facts.replaceChildren(line("time", `${seconds(p.seconds)} · ${bytes(p.bytes)} · ${fixed(p.asked.kerma_mGy, 2)} mGy on the axis`), line("least", `least transmission ${part(p.transmission.least)} · saturated ${part(p.saturated)} · starved ${part(p.starved)}`), line("quality", `contrast to noise of ${p.detail}: `, el("b", { class: `verdict ${enough ? "ok" : "bad"}` }, p.asked.cnr === null ? "saturated" : fixed(cnr, 2)), " ", enough || !(goal > 0) || p.asked.cnr === null
+        ? null
+        : ms <= (scales.exposure_ms?.[1] ?? 0)
+            ? el("button", reach, `${fixed(goal, 1)} takes ${fixed(Math.ceil(ms), 0)} ms at most`)
+            : `no exposure reaches ${fixed(goal, 1)}`), line("best", other
+        ? `best at ${fixed(best.kV, 0)} kV${best.filter ? `, ${best.filter}` : ""}: ${fixed(best.cnr ?? 0, 2)}`
+        : "", ...p.assumed.map((a) => ` · ${a}`)));
     draw(p.transmission);
 }
 function draw({ edges, shares }) {
     chart.hidden = false;
     const room = cleared(chart), style = getComputedStyle(chart);
-    bars(room, shares.map((share) => 1000 * share), (k) => { room[0].fillStyle = style.getPropertyValue(edges[k] < 0.02 ? "--warn" : "--accent"); });
+    bars(room, shares.map((share) => 1000 * share), (k) => {
+        room[0].fillStyle = style.getPropertyValue(edges[k] < 0.02 ? "--warn" : "--accent");
+    });
 }
 on("state", (s) => {
     if (!scales.kV)
@@ -108,5 +175,7 @@ on("state", (s) => {
     panel = seen;
 });
 let stood = "", panel = "";
-$input("#wish-kind").addEventListener("change", () => { if (card.open && scales.kV)
-    changed(); });
+$input("#wish-kind").addEventListener("change", () => {
+    if (card.open && scales.kV)
+        changed();
+});

@@ -33,8 +33,15 @@ export function clicks(acts) {
 }
 // Attributes of what is pressed like a button and looks like none.
 export function pressed(f) {
-    return { role: "button", tabIndex: 0, onclick: f, onkeydown: (e) => { if (e.key === "Enter" && !e.repeat)
-            f(); } };
+    return {
+        role: "button",
+        tabIndex: 0,
+        onclick: f,
+        onkeydown: (e) => {
+            if (e.key === "Enter" && !e.repeat)
+                f();
+        },
+    };
 }
 export function fixed(value, digits = 2) {
     if (!isNumber(value))
@@ -51,7 +58,13 @@ export function parsed(text) {
 // A field for a number (as text: browsers drop what they cannot read from number fields without a word).
 // What is typed is marked until Enter applies it or Escape takes it back.
 export function field(attributes, apply, back) {
-    return numeric(el("input", { type: "text", inputMode: "decimal", autocomplete: "off", class: "num", ...attributes }), apply, back);
+    return numeric(el("input", {
+        type: "text",
+        inputMode: "decimal",
+        autocomplete: "off",
+        class: "num",
+        ...attributes,
+    }), apply, back);
 }
 export function numeric(input, apply, back) {
     input.addEventListener("input", () => input.classList.add("typed"));
@@ -74,7 +87,11 @@ export function seconds(s) {
         return "–";
     s = Math.round(s);
     const h = Math.floor(s / 3600), m = Math.floor((s % 3600) / 60);
-    return h ? `${h} h ${String(m).padStart(2, "0")} min` : m ? `${m} min ${String(s % 60).padStart(2, "0")} s` : `${s} s`;
+    return h
+        ? `${h} h ${String(m).padStart(2, "0")} min`
+        : m
+            ? `${m} min ${String(s % 60).padStart(2, "0")} s`
+            : `${s} s`;
 }
 export function bytes(n) {
     const units = ["B", "kB", "MB", "GB", "TB"];
@@ -85,9 +102,16 @@ export function bytes(n) {
     }
     return `${n.toFixed(i ? 1 : 0)} ${units[i]}`;
 }
-export function setText(node, text) { if (node.textContent !== text)
-    node.textContent = text; }
-export function download(url, name) { const a = el("a", { href: url, download: name }); document.body.append(a); a.click(); a.remove(); }
+export function setText(node, text) {
+    if (node.textContent !== text)
+        node.textContent = text;
+}
+export function download(url, name) {
+    const a = el("a", { href: url, download: name });
+    document.body.append(a);
+    a.click();
+    a.remove();
+}
 export function downloadBlob(blob, name) {
     const url = URL.createObjectURL(blob);
     download(url, name);
@@ -134,8 +158,10 @@ export function curve(canvas, values, low, high) {
     x.strokeStyle = getComputedStyle(canvas).getPropertyValue("--accent");
     x.lineWidth = 1.5 * devicePixelRatio;
     x.beginPath();
-    values.forEach((v, k) => { if (Number.isFinite(v))
-        x.lineTo((w * k) / Math.max(1, values.length - 1), h - 3 - ((h - 6) * (v - low)) / (high - low || 1)); });
+    values.forEach((v, k) => {
+        if (Number.isFinite(v))
+            x.lineTo((w * k) / Math.max(1, values.length - 1), h - 3 - ((h - 6) * (v - low)) / (high - low || 1));
+    });
     x.stroke();
 }
 // How often each value occurs, as its logarithm, so that what is rare shows beside much air.
@@ -149,24 +175,40 @@ export function bars([x, w, h], counts, style) {
 }
 // Pressed or dragged: which part of its width the pointer is at.
 export function slid(canvas, to) {
-    const tell = (e) => { const b = canvas.getBoundingClientRect(); to(Math.min(1, Math.max(0, (e.clientX - b.left) / b.width))); };
-    canvas.addEventListener("pointerdown", (e) => { canvas.setPointerCapture(e.pointerId); tell(e); });
-    canvas.addEventListener("pointermove", (e) => { if (canvas.hasPointerCapture(e.pointerId))
-        tell(e); });
+    const tell = (e) => {
+        const b = canvas.getBoundingClientRect();
+        to(Math.min(1, Math.max(0, (e.clientX - b.left) / b.width)));
+    };
+    canvas.addEventListener("pointerdown", (e) => {
+        canvas.setPointerCapture(e.pointerId);
+        tell(e);
+    });
+    canvas.addEventListener("pointermove", (e) => {
+        if (canvas.hasPointerCapture(e.pointerId))
+            tell(e);
+    });
 }
 // A file that somebody chooses is taken once, and may be chosen again.
 export function chosen(input, take) {
-    input.addEventListener("change", () => { const file = input.files?.[0]; if (file)
-        void take(file); input.value = ""; });
+    input.addEventListener("change", () => {
+        const file = input.files?.[0];
+        if (file)
+            void take(file);
+        input.value = "";
+    });
 }
 // A term that explains itself where it stands: under the pointer, when tapped, and when the keyboard comes to it.
 export const term = (words, tip) => el("button", { type: "button", class: "term", "aria-description": tip, "data-tip": tip }, words);
 // What went wrong, in words.
-export const words = (error) => (error instanceof Error ? error.message : String(error));
+export const words = (error) => error instanceof Error ? error.message : String(error);
 // The element of a kind that an event happened within; elements of other frames are of other classes.
 export const within = (target, selector) => target?.closest?.(selector) ?? null;
 // Keeps a choice in this browser, if it has room.
-export function keep(key, value) { try {
-    localStorage.setItem(key, value);
+export function keep(key, value) {
+    try {
+        localStorage.setItem(key, value);
+    }
+    catch {
+        /* it has no room */
+    }
 }
-catch { /* it has no room */ } }

@@ -12,11 +12,19 @@ function set(width) {
     splitter.setAttribute("aria-valuemin", String(LEAST));
     splitter.setAttribute("aria-valuemax", String(Math.round(most)));
 }
-splitter.addEventListener("pointerdown", (e) => { e.preventDefault(); splitter.setPointerCapture(e.pointerId); });
-splitter.addEventListener("pointermove", (e) => { if (splitter.hasPointerCapture(e.pointerId))
-    set(page.getBoundingClientRect().right - e.clientX); });
+splitter.addEventListener("pointerdown", (e) => {
+    e.preventDefault();
+    splitter.setPointerCapture(e.pointerId);
+});
+splitter.addEventListener("pointermove", (e) => {
+    if (splitter.hasPointerCapture(e.pointerId))
+        set(page.getBoundingClientRect().right - e.clientX);
+});
 splitter.addEventListener("pointerup", () => keep(KEY, String(wide)));
-splitter.addEventListener("dblclick", () => { page.style.removeProperty("--right"); localStorage.removeItem(KEY); });
+splitter.addEventListener("dblclick", () => {
+    page.style.removeProperty("--right");
+    localStorage.removeItem(KEY);
+});
 splitter.addEventListener("keydown", (e) => {
     const step = e.key === "ArrowLeft" ? STEP : e.key === "ArrowRight" ? -STEP : 0;
     if (step) {
@@ -38,7 +46,11 @@ export function large(on) {
 $button("#film-large").addEventListener("click", () => large(!document.body.classList.contains("large")));
 on("tab", () => large(false));
 on("recorded", () => large(false));
-window.addEventListener("keydown", (e) => { if (e.key === "Escape" && document.body.classList.contains("large") && !$dialog("#help-dialog").open) {
-    e.stopImmediatePropagation();
-    large(false);
-} }, true);
+window.addEventListener("keydown", (e) => {
+    if (e.key === "Escape" &&
+        document.body.classList.contains("large") &&
+        !$dialog("#help-dialog").open) {
+        e.stopImmediatePropagation();
+        large(false);
+    }
+}, true);

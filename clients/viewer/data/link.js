@@ -1,12 +1,31 @@
 // The page's connection to its viewer: requests with answers, newest states and images, how old they are,
 // reconnection.
 import { keep, words } from "./dom.js";
-export const pageId = window.pageId = [...crypto.getRandomValues(new Uint8Array(12))].map((b) => b.toString(16).padStart(2, "0")).join("");
+export const pageId = (window.pageId = [...crypto.getRandomValues(new Uint8Array(12))]
+    .map((b) => b.toString(16).padStart(2, "0"))
+    .join(""));
 export const store = {
-    state: null, framing: null, near: null, hello: null, session: null,
-    twin: false, viewer: false, layers: {}, opacity: 1, image: null, recorded: null, hidden: false,
-    received: { state: 0, image: 0 }, age: 0, fresh: null, imageAge: 0, job: null, refused: null,
-    problem: null, coneVec: null, cameras: null,
+    state: null,
+    framing: null,
+    near: null,
+    hello: null,
+    session: null,
+    twin: false,
+    viewer: false,
+    layers: {},
+    opacity: 1,
+    image: null,
+    recorded: null,
+    hidden: false,
+    received: { state: 0, image: 0 },
+    age: 0,
+    fresh: null,
+    imageAge: 0,
+    job: null,
+    refused: null,
+    problem: null,
+    coneVec: null,
+    cameras: null,
 };
 // Older than OLD_S, what is shown is said to be old; after SILENT_S nobody waits for answers any more.
 export const OLD_S = 1;
@@ -24,9 +43,13 @@ export class Failure extends Error {
     }
 }
 let socket = null, nextId = 1, pause = 200;
-export function on(what, f) { (listeners[what] ??= []).push(f); }
-export function emit(what, ...args) { for (const f of listeners[what] ?? [])
-    f(...args); }
+export function on(what, f) {
+    (listeners[what] ??= []).push(f);
+}
+export function emit(what, ...args) {
+    for (const f of listeners[what] ?? [])
+        f(...args);
+}
 export function call(method, params = {}) {
     return new Promise((resolve, reject) => {
         if (!socket || socket.readyState !== WebSocket.OPEN) {
@@ -51,11 +74,20 @@ export async function command(method, params = {}, title = "Refused") {
 // Who is there: kept in this browser, and told to the twin with each connection.
 const PERSON = "flexdt-person";
 export const person = () => localStorage.getItem(PERSON) ?? "";
-export function rename(name) { keep(PERSON, name.trim()); socket?.close(); }
+export function rename(name) {
+    keep(PERSON, name.trim());
+    socket?.close();
+}
 export function connect() {
     socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws/${pageId}?person=${encodeURIComponent(person())}`);
     socket.binaryType = "arraybuffer";
-    socket.onopen = () => { store.viewer = true; parts = []; heard = least = null; emit("connection"); emit("open"); };
+    socket.onopen = () => {
+        store.viewer = true;
+        parts = [];
+        heard = least = null;
+        emit("connection");
+        emit("open");
+    };
     socket.onmessage = (event) => {
         if (typeof event.data === "string")
             text(event.data);
@@ -88,7 +120,12 @@ const handlers = {
     },
     state(m) {
         took("state");
-        Object.assign(store, { state: m.state, framing: m.framing, near: m.near, coneVec: m.cone_vec });
+        Object.assign(store, {
+            state: m.state,
+            framing: m.framing,
+            near: m.near,
+            coneVec: m.cone_vec,
+        });
         store.received.state++;
         if (!store.twin) {
             store.twin = true;
@@ -98,19 +135,44 @@ const handlers = {
     },
     link(m) {
         pause = 200;
-        Object.assign(store, { refused: null, twin: m.connected, problem: m.problem, cameras: m.cameras });
+        Object.assign(store, {
+            refused: null,
+            twin: m.connected,
+            problem: m.problem,
+            cameras: m.cameras,
+        });
         store.hello = m.hello ?? store.hello;
         emit("connection");
     },
-    session(m) { store.session = m.session; emit("connection"); if (m.connected)
-        emit("session"); },
-    volume(m) { took("volume"); emit("volume", m); },
-    layers(m) { store.layers = m.shown; store.opacity = m.opacity; emit("layers"); },
-    job(m) { emit("job", m.data); },
-    note(m) { emit("note", m.level, m.title, m.body); },
-    log(m) { emit("log", m.data); },
-    beat(m) { heard = { at: performance.now(), late: late(m.at), silent: m.silent_s }; if (rested())
-        look(); },
+    session(m) {
+        store.session = m.session;
+        emit("connection");
+        if (m.connected)
+            emit("session");
+    },
+    volume(m) {
+        took("volume");
+        emit("volume", m);
+    },
+    layers(m) {
+        store.layers = m.shown;
+        store.opacity = m.opacity;
+        emit("layers");
+    },
+    job(m) {
+        emit("job", m.data);
+    },
+    note(m) {
+        emit("note", m.level, m.title, m.body);
+    },
+    log(m) {
+        emit("log", m.data);
+    },
+    beat(m) {
+        heard = { at: performance.now(), late: late(m.at), silent: m.silent_s };
+        if (rested())
+            look();
+    },
 };
 function text(content) {
     const m = JSON.parse(content);
@@ -124,19 +186,23 @@ const DRIFT = 1e-4;
 let heard = null, least = null;
 function late(sent) {
     const now = performance.now() / 1000;
-    least = least === null ? { lag: now - sent, at: now } : { lag: Math.min(now - sent, least.lag + DRIFT * (now - least.at)), at: now };
+    least =
+        least === null
+            ? { lag: now - sent, at: now }
+            : { lag: Math.min(now - sent, least.lag + DRIFT * (now - least.at)), at: now };
     return now - sent - least.lag;
 }
 let differs = null;
 function look() {
     const now = performance.now();
     store.age = heard === null ? 0 : (now - heard.at) / 1000 + heard.late + heard.silent;
-    store.fresh = store.age > OLD_S ? null : store.fresh ?? now;
+    store.fresh = store.age > OLD_S ? null : (store.fresh ?? now);
     // An image of another pose than the state's is old, once none has come for a while.
     const i = store.image, c = store.coneVec;
     const apart = i && !i.recorded && c && i.cone_vec.some((v, k) => Math.abs(v - c[k]) > 1e-3) ? i : null;
-    differs = apart ? differs ?? now : null;
-    store.imageAge = apart && differs !== null ? (now - Math.max(differs, apart.at_ms)) / 1000 : 0;
+    differs = apart ? (differs ?? now) : null;
+    store.imageAge =
+        apart && differs !== null ? (now - Math.max(differs, apart.at_ms)) / 1000 : 0;
     emit("age");
 }
 // A page that itself stood still (much to draw, a laptop asleep) first reads what has come meanwhile, before it
@@ -159,8 +225,10 @@ setInterval(() => {
         }
 }, LOOK_MS);
 // What is acknowledged makes room for the next: so nothing old waits in sockets.
-function took(slot) { if (socket?.readyState === WebSocket.OPEN)
-    socket.send(`{"took":"${slot}"}`); }
+function took(slot) {
+    if (socket?.readyState === WebSocket.OPEN)
+        socket.send(`{"took":"${slot}"}`);
+}
 let parts = [];
 function part(buffer) {
     took("image");
@@ -169,7 +237,10 @@ function part(buffer) {
     if (bytes[0] === 0)
         return;
     const whole = new Uint8Array(parts.reduce((n, p) => n + p.length, 0));
-    parts.reduce((n, p) => { whole.set(p, n); return n + p.length; }, 0);
+    parts.reduce((n, p) => {
+        whole.set(p, n);
+        return n + p.length;
+    }, 0);
     parts = [];
     void image(whole);
 }
@@ -201,7 +272,9 @@ async function image(whole) {
     const number = ++arrived, size = new DataView(whole.buffer).getUint32(4, true);
     const head = JSON.parse(new TextDecoder().decode(whole.subarray(8, 8 + size))), at_ms = performance.now();
     const all = await decoders[head.code](whole.subarray(8 + size), head.shape), n = all.length / 2;
-    const got = head.pair ? { ...head, at_ms, pixels: all.subarray(0, n), virtual: all.subarray(n) } : { ...head, at_ms, pixels: all };
+    const got = head.pair
+        ? { ...head, at_ms, pixels: all.subarray(0, n), virtual: all.subarray(n) }
+        : { ...head, at_ms, pixels: all };
     if (number < unpacked)
         return; // a newer one was quicker
     unpacked = number;

@@ -7,28 +7,64 @@ let marks = [], last = null, held = false, of = null;
 const projection = () => store.image?.recorded?.projection ?? null;
 const here = () => marks.filter((m) => m.frame === projection());
 const tools = el("span", { class: "row", style: "flex-wrap:wrap", hidden: true });
-const toggle = el("button", { id: "mark", class: "small", "aria-pressed": "false", title: "Click beads in the images, to calibrate from them; in the radiograph Enter marks its middle, arrows move the last mark by 0.1 px, with Shift by 5", onclick: () => { choose(Boolean(tools.hidden)); } }, "Mark beads");
+const toggle = el("button", {
+    id: "mark",
+    class: "small",
+    "aria-pressed": "false",
+    title: "Click beads in the images, to calibrate from them; in the radiograph Enter marks its middle, arrows move the last mark by 0.1 px, with Shift by 5",
+    onclick: () => {
+        choose(Boolean(tools.hidden));
+    },
+}, "Mark beads");
 const said = el("span", { class: "muted small-text", "aria-live": "polite" }), list = el("span", { id: "marks", class: "row", style: "flex-wrap:wrap" });
-function choose(wanted) { tools.hidden = !wanted; toggle.setAttribute("aria-pressed", String(wanted)); again(); }
-function again() { tell(); emit("image", store.image); }
+function choose(wanted) {
+    tools.hidden = !wanted;
+    toggle.setAttribute("aria-pressed", String(wanted));
+    again();
+}
+function again() {
+    tell();
+    emit("image", store.image);
+}
 // The row of the panel; what is marked is handed on by `calibrate`.
 export function row(calibrate) {
-    tools.append(el("label", { class: "inline muted" }, "bead ", el("input", { type: "number", id: "mark-bead", min: 0, value: 0, style: "width:58px" })), list, said, el("button", { id: "mark-fit", class: "small", onclick: () => { calibrate(marks); } }, "Calibrate from these"));
+    tools.append(el("label", { class: "inline muted" }, "bead ", el("input", { type: "number", id: "mark-bead", min: 0, value: 0, style: "width:58px" })), list, said, el("button", {
+        id: "mark-fit",
+        class: "small",
+        onclick: () => {
+            calibrate(marks);
+        },
+    }, "Calibrate from these"));
     return el("div", { class: "row head", id: "mark-row" }, toggle, tools);
 }
 const several = (n, what) => `${n} ${what}${n === 1 ? "" : "s"}`;
-function remove(mark) { marks = marks.filter((m) => m !== mark); again(); }
+function remove(mark) {
+    marks = marks.filter((m) => m !== mark);
+    again();
+}
 function tell() {
     const frame = projection();
-    list.replaceChildren(...here().map((m) => el("button", { class: "small", title: `Remove the mark of bead ${m.marker}`, onclick: () => { remove(m); } }, `${m.marker} ×`)));
-    const at = last && here().includes(last) ? ` · ${last.marker} at ${fixed(last.column, 1)}, ${fixed(last.row, 1)}` : "";
-    setText(said, frame === null ? "no projection is shown" : `${several(marks.length, "mark")} in ${several(new Set(marks.map((m) => m.frame)).size, "image")}${at}`);
+    list.replaceChildren(...here().map((m) => el("button", {
+        class: "small",
+        title: `Remove the mark of bead ${m.marker}`,
+        onclick: () => {
+            remove(m);
+        },
+    }, `${m.marker} ×`)));
+    const at = last && here().includes(last)
+        ? ` · ${last.marker} at ${fixed(last.column, 1)}, ${fixed(last.row, 1)}`
+        : "";
+    setText(said, frame === null
+        ? "no projection is shown"
+        : `${several(marks.length, "mark")} in ${several(new Set(marks.map((m) => m.frame)).size, "image")}${at}`);
 }
-on("recorded", (name) => { if (name !== of) {
-    of = name;
-    marks = [];
-    choose(false);
-} });
+on("recorded", (name) => {
+    if (name !== of) {
+        of = name;
+        marks = [];
+        choose(false);
+    }
+});
 on("image", tell);
 // Places are in the picture's coordinates: the middle of its first pixel is (0.5, 0.5) there.
 export function click([column, line]) {
@@ -42,7 +78,9 @@ export function click([column, line]) {
 }
 // Whether a press is on a mark, which a drag then moves; a click there is a bead that lies over it.
 export function press([column, line], reach) {
-    const near = tools.hidden ? undefined : here().find((m) => Math.hypot(m.column + 0.5 - column, m.row + 0.5 - line) < reach);
+    const near = tools.hidden
+        ? undefined
+        : here().find((m) => Math.hypot(m.column + 0.5 - column, m.row + 0.5 - line) < reach);
     held = near !== undefined;
     if (near) {
         last = near;
@@ -61,7 +99,9 @@ export function drag([column, line]) {
     }
     return held;
 }
-export function release() { held = false; }
+export function release() {
+    held = false;
+}
 // The arrows: whether there is a mark that they move.
 export function shift([x, y], far) {
     if (tools.hidden || !last || !here().includes(last))

@@ -1,5 +1,5 @@
 // The Scan tab: a script to write, check, scrub and run; the job's progress; thumbnails of its frames.
-import { $, $button, $canvas, $input, $select, bytes, chosen, clicks, el, fixed, isNumber, pressed, putGrey, seconds, slid, words } from "./dom.js";
+import { $, $button, $canvas, $input, $select, bytes, chosen, clicks, el, fixed, isNumber, pressed, putGrey, seconds, slid, words, } from "./dom.js";
 import { call, command, emit, Failure, on, store } from "./link.js";
 import { rememberedScript, rememberScript } from "./address.js";
 import { folder, open as openData } from "./data.js";
@@ -11,13 +11,23 @@ const text = $("#script"), gutter = $("#gutter"), ink = $("#paint div"), LINE_PX
 let written = [""], worst = new Map(), problems = [], plan = null, planned = "", lost = false, sent = "";
 designer.place($("#tab-scan .card"));
 clicks({
-    "script-open": () => $input("#script-file").click(), "check": checkAndPlan, "plan": showPlan, run,
-    "compose": () => compose(), "unscrub": () => scrub(null), "job-scrub": recall,
+    "script-open": () => $input("#script-file").click(),
+    check: checkAndPlan,
+    plan: showPlan,
+    run,
+    compose: () => compose(),
+    unscrub: () => scrub(null),
+    "job-scrub": recall,
     "job-forget": forgetJob,
-    "job-data": () => { emit("show-tab", "data"); void openData(folder(store.job), null, true); },
+    "job-data": () => {
+        emit("show-tab", "data");
+        void openData(folder(store.job), null, true);
+    },
 });
 for (const action of ["pause", "resume", "step", "abort"])
-    clicks({ [`job-${action}`]: () => command(`job.${action}`, { job: store.job?.job }, `Cannot ${action}`) });
+    clicks({
+        [`job-${action}`]: () => command(`job.${action}`, { job: store.job?.job }, `Cannot ${action}`),
+    });
 function marks() {
     written = text.value.split("\n");
     worst = new Map();
@@ -34,29 +44,52 @@ function marks() {
     }
     paint();
 }
-const said = (line) => problems.filter((p) => p.line === line).map((p) => p.message).join("; ");
+const said = (line) => problems
+    .filter((p) => p.line === line)
+    .map((p) => p.message)
+    .join("; ");
 // The lines in sight, under the text itself, which is transparent: component, command, values, comments.
 function paint() {
     const first = Math.max(0, Math.floor(text.scrollTop / LINE_PX) - 1), count = Math.ceil(text.clientHeight / LINE_PX) + 2;
-    ink.replaceChildren(...written.slice(first, first + count).map((line, i) => el("div", { class: worst.get(first + i + 1) ?? "" }, ...inked(line))));
+    ink.replaceChildren(...written
+        .slice(first, first + count)
+        .map((line, i) => el("div", { class: worst.get(first + i + 1) ?? "" }, ...inked(line))));
     ink.style.transform = `translate(${-text.scrollLeft}px, ${first * LINE_PX - text.scrollTop}px)`;
     gutter.scrollTop = text.scrollTop;
 }
 function inked(line) {
     if (/^\s*(#|\/\/|;)/.test(line))
         return [el("i", {}, line)];
-    return line.slice(0, 2000).split("\t").flatMap((word, k) => [k ? "\t" : "", k === 0 ? el("b", {}, word) : k > 1 && /^[-+]?[\d.]/.test(word) ? el("u", {}, word) : word]);
+    return line
+        .slice(0, 2000)
+        .split("\t")
+        .flatMap((word, k) => [
+        k ? "\t" : "",
+        k === 0
+            ? el("b", {}, word)
+            : k > 1 && /^[-+]?[\d.]/.test(word)
+                ? el("u", {}, word)
+                : word,
+    ]);
 }
 // What is wrong with the line that the caret is in.
 function tellLine() {
-    const line = document.activeElement === text && worst.size ? text.value.slice(0, text.selectionStart).split("\n").length : 0;
+    const line = document.activeElement === text && worst.size
+        ? text.value.slice(0, text.selectionStart).split("\n").length
+        : 0;
     $("#line-note").textContent = worst.has(line) ? `line ${line}: ${said(line)}` : "";
     $("#line-note").className = `small-text ${worst.get(line) === "hit" ? "error" : ""}`;
 }
 document.addEventListener("selectionchange", tellLine);
 new ResizeObserver(paint).observe(text);
 // What was found out belongs to the script as it stood: report, marks and timeline go with an edit.
-function outdated() { problems = []; marks(); $("#report").textContent = ""; forget(); rememberScript(text.value); }
+function outdated() {
+    problems = [];
+    marks();
+    $("#report").textContent = "";
+    forget();
+    rememberScript(text.value);
+}
 const dismiss = () => void call("viewer.plan", { text: null }).catch(() => { });
 function forget() {
     $("#timeline-card").hidden = true;
@@ -79,9 +112,18 @@ text.addEventListener("keydown", (e) => {
     }
     leaving = e.key === "Escape";
 });
-text.addEventListener("blur", () => { leaving = false; });
-chosen($input("#script-file"), async (file) => { setScript(await file.text()); sent = file.name.replace(/\.[^.]*$/, ""); });
-export function setScript(value) { text.value = value; sent = ""; outdated(); }
+text.addEventListener("blur", () => {
+    leaving = false;
+});
+chosen($input("#script-file"), async (file) => {
+    setScript(await file.text());
+    sent = file.name.replace(/\.[^.]*$/, "");
+});
+export function setScript(value) {
+    text.value = value;
+    sent = "";
+    outdated();
+}
 export function goTo(line) {
     if (!line)
         return;
@@ -102,19 +144,27 @@ async function compose(keep = []) {
         emit("note", "error", none, "ms: a number above 0");
         return;
     }
-    const answer = await command("viewer.compose", { kind: $select("#wish-kind").value, ...designer.wish(), frames, exposure_ms, keep }, none);
+    const answer = await command("viewer.compose", {
+        kind: $select("#wish-kind").value,
+        ...designer.wish(),
+        frames,
+        exposure_ms,
+        keep,
+    }, none);
     if (!answer)
         return;
     setScript(answer.text);
-    const mine = made = text.value;
+    const mine = (made = text.value);
     await check();
     if (text.value === mine)
         offer(answer.moved, keep);
 }
 // The designer rewrites what was written here; a script of somebody's own stays until Write is pressed.
 let made = "";
-on("design", () => { if (!text.value || text.value === made)
-    void compose(); });
+on("design", () => {
+    if (!text.value || text.value === made)
+        void compose();
+});
 // What stands elsewhere than a scan's script would put it may be meant so.
 function offer(moved, kept) {
     const axes = Object.entries(moved), unit = (axis) => (store.state?.axes[axis]?.unit === "deg" ? "°" : " mm");
@@ -122,7 +172,11 @@ function offer(moved, kept) {
         $("#report").prepend(el("div", { id: "kept" }, `kept where it stands: ${kept.join(", ")}`));
     if (!axes.length)
         return;
-    $("#report").prepend(el("div", { id: "moved" }, ...axes.map(([axis, [now, then]]) => el("div", {}, `${axis} stands at ${fixed(now, 2)}${unit(axis)}; the script puts it to ${fixed(then, 2)}`)), el("button", { id: "keep", class: "small", onclick: () => compose([...kept, ...Object.keys(moved)]) }, axes.length > 1 ? "Keep them where they stand" : "Keep it where it stands")));
+    $("#report").prepend(el("div", { id: "moved" }, ...axes.map(([axis, [now, then]]) => el("div", {}, `${axis} stands at ${fixed(now, 2)}${unit(axis)}; the script puts it to ${fixed(then, 2)}`)), el("button", {
+        id: "keep",
+        class: "small",
+        onclick: () => compose([...kept, ...Object.keys(moved)]),
+    }, axes.length > 1 ? "Keep them where they stand" : "Keep it where it stands")));
 }
 async function check() {
     const report = $("#report"), asked = text.value;
@@ -134,15 +188,31 @@ async function check() {
     catch (error) {
         if (text.value !== asked)
             return false;
-        const data = error instanceof Failure ? error.data : null;
+        const data = error instanceof Failure
+            ? error.data
+            : null;
         const list = Array.isArray(data) ? data : data?.problems;
         if (!Array.isArray(list)) {
             report.textContent = "";
             emit("note", "error", "Check", words(error));
             return false;
         }
-        const problems = list.map((p) => ({ severity: "error", code: "syntax", line: null, column: null, ...p }));
-        answer = { ok: false, problems, steps: [], frames: 0, bytes: 0, duration_s: NaN, min_clearance_mm: null };
+        const problems = list.map((p) => ({
+            severity: "error",
+            code: "syntax",
+            line: null,
+            column: null,
+            ...p,
+        }));
+        answer = {
+            ok: false,
+            problems,
+            steps: [],
+            frames: 0,
+            bytes: 0,
+            duration_s: NaN,
+            min_clearance_mm: null,
+        };
     }
     if (text.value !== asked)
         return false;
@@ -150,17 +220,26 @@ async function check() {
     return answer.ok;
 }
 // A script that may run is drawn over time, too.
-async function checkAndPlan() { if (await check())
-    await makePlan(text.value, null); }
+async function checkAndPlan() {
+    if (await check())
+        await makePlan(text.value, null);
+}
 export function show(r) {
     // Each of `collisions` is among the problems already, in words.
-    problems = r.problems.map((p) => (p.code === "collision" ? { ...p, message: `collision: ${p.message}` } : p));
+    problems = r.problems.map((p) => p.code === "collision" ? { ...p, message: `collision: ${p.message}` } : p);
     marks();
     const box = $("#report");
     box.textContent = "";
-    const clearance = isNumber(r.min_clearance_mm) ? ` · moving parts stay ${fixed(r.min_clearance_mm, 1)} mm apart` : "";
-    box.append(el("div", {}, el("span", { class: `verdict ${r.ok ? "ok" : "bad"}` }, r.ok ? "Ready to run" : "Not ready"), el("span", { class: "muted", title: "Of parts that move against each other; those that stand or move together are not counted" }, `  ${seconds(r.duration_s)} · ${r.frames} frames · ${bytes(r.bytes)}${clearance}`)));
-    const link = (line) => (line ? el("a", pressed(() => goTo(line)), `line ${line}`) : el("span", { class: "muted" }, "whole"));
+    const clearance = isNumber(r.min_clearance_mm)
+        ? ` · moving parts stay ${fixed(r.min_clearance_mm, 1)} mm apart`
+        : "";
+    box.append(el("div", {}, el("span", { class: `verdict ${r.ok ? "ok" : "bad"}` }, r.ok ? "Ready to run" : "Not ready"), el("span", {
+        class: "muted",
+        title: "Of parts that move against each other; those that stand or move together are not counted",
+    }, `  ${seconds(r.duration_s)} · ${r.frames} frames · ${bytes(r.bytes)}${clearance}`)));
+    const link = (line) => line
+        ? el("a", pressed(() => goTo(line)), `line ${line}`)
+        : el("span", { class: "muted" }, "whole");
     for (const p of problems.slice(0, 100)) {
         box.append(el("div", { class: "problem" }, link(p.line), el("span", { class: p.severity === "error" ? "error" : "" }, p.message)));
     }
@@ -170,7 +249,11 @@ export function show(r) {
 }
 // A report holds for what the machine was when it came: any client may change that.
 let checked = null;
-const stands = (s) => JSON.stringify([s.sample, s.correction, Object.entries(s.axes).map(([name, { position }]) => [name, position.toFixed(2)])]);
+const stands = (s) => JSON.stringify([
+    s.sample,
+    s.correction,
+    Object.entries(s.axes).map(([name, { position }]) => [name, position.toFixed(2)]),
+]);
 on("state", (s) => {
     const box = $("#report"), stale = box.querySelector(".verdict") !== null && checked !== stands(s);
     box.classList.toggle("stale", stale);
@@ -181,8 +264,11 @@ on("state", (s) => {
         old?.remove();
 });
 function stepRow(s) {
-    const go = () => { goTo(s.line); if (plan)
-        void scrub(s.start_s + s.duration_s); };
+    const go = () => {
+        goTo(s.line);
+        if (plan)
+            void scrub(s.start_s + s.duration_s);
+    };
     return el("div", pressed(go), el("a", {}, String(s.line ?? "")), el("span", { class: "muted" }, `${fixed(s.start_s, 1)} s`), el("span", { title: s.what }, s.what));
 }
 async function makePlan(script = text.value, time = 0) {
@@ -198,7 +284,10 @@ async function makePlan(script = text.value, time = 0) {
         forget();
         return;
     }
-    const units = Object.fromEntries(Object.keys(answer.curves).map((axis) => [axis, store.state?.axes[axis]?.unit === "deg" ? "°" : "mm"]));
+    const units = Object.fromEntries(Object.keys(answer.curves).map((axis) => [
+        axis,
+        store.state?.axes[axis]?.unit === "deg" ? "°" : "mm",
+    ]));
     plan = { ...answer, units };
     planned = script;
     $("#timeline-card").hidden = false;
@@ -211,13 +300,19 @@ async function showPlan() {
         $("#timeline-card").scrollIntoView({ block: "nearest" });
 }
 // A plan lives in the viewer: one that was started again makes it anew, once it has seen the twin.
-on("open", () => { lost = plan !== null; });
-on("layers", () => { if (lost) {
-    lost = false;
-    void makePlan(planned, at);
-} });
-on("recorded", (name) => { if (name !== null)
-    forget(); });
+on("open", () => {
+    lost = plan !== null;
+});
+on("layers", () => {
+    if (lost) {
+        lost = false;
+        void makePlan(planned, at);
+    }
+});
+on("recorded", (name) => {
+    if (name !== null)
+        forget();
+});
 // A scan that was run, as it was planned: its script lies with its data set.
 async function recall() {
     const dataset = folder(store.job);
@@ -227,7 +322,10 @@ async function recall() {
         await showPlan();
     }
 }
-function bring(script) { emit("show-tab", "scan"); setScript(script); }
+function bring(script) {
+    emit("show-tab", "scan");
+    setScript(script);
+}
 on("script", bring);
 let asking = false, next = null, at = null;
 export async function scrub(time) {
@@ -249,16 +347,30 @@ function redraw() {
         return;
     drawTimeline($canvas("#timeline"), plan, at, store.job && !FINAL.includes(store.job.state) ? store.job.elapsed_s : null);
     const now = at, step = now === null ? null : plan.steps.findLast((s) => s.start_s <= now + 1e-9);
-    $("#scrub-at").textContent = at === null ? `${seconds(plan.duration_s)} in all` : `${fixed(at, 1)} s · line ${step?.line ?? "–"} · ${step?.what ?? ""}`;
+    $("#scrub-at").textContent =
+        at === null
+            ? `${seconds(plan.duration_s)} in all`
+            : `${fixed(at, 1)} s · line ${step?.line ?? "–"} · ${step?.what ?? ""}`;
     $("#scrub-at").title = $("#scrub-at").textContent;
-    const told = { "aria-valuemax": plan.duration_s, "aria-valuenow": at ?? 0, "aria-valuetext": $("#scrub-at").textContent };
+    const told = {
+        "aria-valuemax": plan.duration_s,
+        "aria-valuenow": at ?? 0,
+        "aria-valuetext": $("#scrub-at").textContent,
+    };
     for (const [name, value] of Object.entries(told))
         canvas.setAttribute(name, String(value));
 }
 const canvas = $canvas("#timeline");
-slid(canvas, (part) => { if (plan)
-    void scrub(part * plan.duration_s); });
-const STEPS = { ArrowLeft: -0.01, ArrowRight: 0.01, Home: -1, End: 1 };
+slid(canvas, (part) => {
+    if (plan)
+        void scrub(part * plan.duration_s);
+});
+const STEPS = {
+    ArrowLeft: -0.01,
+    ArrowRight: 0.01,
+    Home: -1,
+    End: 1,
+};
 canvas.addEventListener("keydown", (e) => {
     const step = STEPS[e.key];
     if (step && plan) {
@@ -270,7 +382,10 @@ canvas.addEventListener("keydown", (e) => {
 new ResizeObserver(redraw).observe(canvas);
 async function run() {
     const speed = $select("#speed-up").value;
-    const params = { text: text.value, speed_up: speed === "max" ? "max" : Number(speed) };
+    const params = {
+        text: text.value,
+        speed_up: speed === "max" ? "max" : Number(speed),
+    };
     if (sent)
         params.name = `${sent}-${new Date().toISOString().slice(0, 19).replace(/[:T]/g, "-")}`;
     const answer = await call("script.submit", params).catch((error) => {
@@ -288,8 +403,10 @@ async function run() {
 }
 // Jobs come in events of their own and inside states, which may be a little older: those change nothing.
 let toldAt = -Infinity;
-on("connection", () => { if (!store.twin)
-    toldAt = -Infinity; }); // a twin that starts again counts from 0
+on("connection", () => {
+    if (!store.twin)
+        toldAt = -Infinity;
+}); // a twin that starts again counts from 0
 function showJob(job) {
     const last = store.job, fresh = last?.job !== job.job;
     if (fresh && job.state === "queued" && last && !FINAL.includes(last.state))
@@ -312,13 +429,21 @@ function showJob(job) {
     $("#job-card").hidden = false;
     $("#job-name").textContent = job.name || job.job;
     $("#job-state").textContent = `${job.state}${pace(job.speed_up)}`;
-    const bar = $("#job-bar"), share = job.frames_total ? job.frames_done / job.frames_total : job.state === "done" ? 1 : 0;
+    const bar = $("#job-bar"), share = job.frames_total
+        ? job.frames_done / job.frames_total
+        : job.state === "done"
+            ? 1
+            : 0;
     bar.className = `progress ${over && job.state !== "done" ? "failed" : job.state}`;
     $("i", bar).style.width = `${(100 * share).toFixed(1)}%`;
     $("#job-frames").textContent = `${job.frames_done} / ${job.frames_total} frames`;
     $("#job-left").textContent = over ? seconds(job.elapsed_s) : left(job);
     const line = job.line ? `line ${job.line}: ` : "";
-    $("#job-what").textContent = job.error ? told(job) : over ? job.dataset ?? "" : `${line}${job.what}`;
+    $("#job-what").textContent = job.error
+        ? told(job)
+        : over
+            ? (job.dataset ?? "")
+            : `${line}${job.what}`;
     $button("#job-pause").disabled = job.state !== "running";
     $button("#job-resume").disabled = $button("#job-step").disabled = job.state !== "paused";
     $button("#job-abort").disabled = over;
@@ -327,14 +452,17 @@ function showJob(job) {
     if (fresh || plan)
         redraw();
 }
-const told = (job) => (typeof job.error?.message === "string" ? job.error.message : "");
-const pace = (speed) => (speed === "max" ? " · max" : speed !== 1 ? ` · ${speed}×` : "");
+const told = (job) => typeof job.error?.message === "string" ? job.error.message : "";
+const pace = (speed) => speed === "max" ? " · max" : speed !== 1 ? ` · ${speed}×` : "";
 function left(job) {
     const factor = job.real_time_factor || (job.speed_up === "max" ? null : job.speed_up);
-    return isNumber(job.remaining_s) ? `${seconds(factor ? job.remaining_s / factor : job.remaining_s)} left` : "";
+    return isNumber(job.remaining_s)
+        ? `${seconds(factor ? job.remaining_s / factor : job.remaining_s)} left`
+        : "";
 }
 // A stop that somebody commanded is no failure: the warning below the scene says that the scan is paused.
-const meant = (job) => job.state === "paused" && ["stop", "E-stop"].includes(job.error?.data?.asked ?? "");
+const meant = (job) => job.state === "paused" &&
+    ["stop", "E-stop"].includes(job.error?.data?.asked ?? "");
 on("job", (job) => {
     const before = store.job, news = before?.job === job.job && before.state !== job.state;
     showJob(job);
@@ -355,7 +483,7 @@ async function catchUp() {
     if (job === undefined || performance.now() < caughtUp + AGAIN_MS)
         return;
     caughtUp = performance.now();
-    const status = await call("job.status", { job }).catch((error) => (error instanceof Failure && error.code === -32602 ? null : undefined));
+    const status = await call("job.status", { job }).catch((error) => error instanceof Failure && error.code === -32602 ? null : undefined);
     if (store.job?.job !== job || status === undefined)
         return;
     if (status) {
@@ -378,7 +506,11 @@ let lastThumb = -1, lastImage = 0, ended = null;
 on("image", thumb);
 function thumb() {
     const job = store.job, image = store.image;
-    if (!job || !job.frames_done || !image || image.recorded || store.received.image === lastImage)
+    if (!job ||
+        !job.frames_done ||
+        !image ||
+        image.recorded ||
+        store.received.image === lastImage)
         return;
     if (ended && image.time > ended.time && performance.now() > ended.at + 1000 * LATE_S)
         return;
@@ -391,12 +523,16 @@ function thumb() {
     const [rows, cols] = image.shape, w = 124, h = Math.max(1, Math.round((w * rows) / cols));
     const c = el("canvas"), [low, high] = image.window;
     putGrey(c, [h, w], (k) => {
-        const r = Math.floor(k / w), v = image.low + image.scale * image.pixels[Math.floor((r * rows) / h) * cols + Math.floor(((k - r * w) * cols) / w)];
+        const r = Math.floor(k / w), v = image.low +
+            image.scale *
+                image.pixels[Math.floor((r * rows) / h) * cols + Math.floor(((k - r * w) * cols) / w)];
         return Math.min(255, Math.max(0, (255 * (v - low)) / (high - low))) | 0;
     });
     $("#thumbs").append(el("figure", {}, c, el("figcaption", {}, String(job.frames_done))));
     $("#thumbs").scrollLeft = 1e6;
 }
 marks();
-void rememberedScript().then((script) => { if (script && !text.value)
-    setScript(script); });
+void rememberedScript().then((script) => {
+    if (script && !text.value)
+        setScript(script);
+});

@@ -1,5 +1,5 @@
 // The Setup tab: tube, camera, sample on the stage (with upload), layers of the scene.
-import { $, $$, $button, $canvas, $input, $select, base64, cleared, clicks, el, fixed, keep, numeric, parsed, words } from "./dom.js";
+import { $, $$, $button, $canvas, $input, $select, base64, cleared, clicks, el, fixed, keep, numeric, parsed, words, } from "./dom.js";
 import { call, command, emit, on, store } from "./link.js";
 const CHUNK = 3 << 20;
 const FORMATS = ["stl", "obj", "ply", "glb", "off"];
@@ -10,22 +10,29 @@ for (const input of $$("#tab-setup .num")) {
 }
 for (const list of [$select("#mode"), $select("#sample")]) {
     list.addEventListener("change", () => list.classList.add("typed"));
-    list.addEventListener("keydown", (e) => { if (e.key === "Escape")
-        takeBack(list.id); });
+    list.addEventListener("keydown", (e) => {
+        if (e.key === "Escape")
+            takeBack(list.id);
+    });
 }
 for (const box of $$("[data-layer]"))
     box.addEventListener("change", () => void showLayer(box.dataset.layer ?? "", box.checked));
 const opacity = $input("#opacity");
 opacity.addEventListener("change", () => void reveal({ opacity: Number(opacity.value) }));
 clicks({
-    "tube-apply": setTube, "camera-apply": setCamera, "sample-apply": setSample, "sample-delete": deleteSample, predict, "mesh-upload": sendMesh,
-    "beam": () => command("tube.set", { on: !store.state?.tube.on }, "The tube refuses"),
+    "tube-apply": setTube,
+    "camera-apply": setCamera,
+    "sample-apply": setSample,
+    "sample-delete": deleteSample,
+    predict,
+    "mesh-upload": sendMesh,
+    beam: () => command("tube.set", { on: !store.state?.tube.on }, "The tube refuses"),
 });
 // A field or a list of these.
 const of = (id) => $(`#${id}`);
 const typed = (id) => $(`#${id}`).classList.contains("typed");
 function put(id, value, digits = 0) {
-    const input = of(id), text = typeof value === "number" ? String(Number(value.toFixed(digits))) : value ?? "";
+    const input = of(id), text = typeof value === "number" ? String(Number(value.toFixed(digits))) : (value ?? "");
     input.title = typed(id) ? `not applied yet; the twin has ${text}` : "";
     if (typed(id) || input.value === text)
         return;
@@ -76,8 +83,17 @@ async function apply(method, fields, title) {
     else
         takeBack(...same());
 }
-function setTube() { return apply("tube.set", { kV: "kV", power_W: "power" }, "The tube refuses"); }
-function setCamera() { return apply("camera.set", { exposure_ms: "exposure", averages: "averages", mode: "mode", roi: ROI.map((k) => `roi-${k}`) }, "The camera refuses"); }
+function setTube() {
+    return apply("tube.set", { kV: "kV", power_W: "power" }, "The tube refuses");
+}
+function setCamera() {
+    return apply("camera.set", {
+        exposure_ms: "exposure",
+        averages: "averages",
+        mode: "mode",
+        roi: ROI.map((k) => `roi-${k}`),
+    }, "The camera refuses");
+}
 async function setSample() {
     const ids = SIX.map((k) => `off-${k}`), values = numbers(...ids);
     if (!values)
@@ -96,7 +112,10 @@ async function setSample() {
 // had to be changed is never one that is taken, so nothing is overwritten by accident.
 export function sampleName(file, taken) {
     const bare = file.replace(/\.[^.]*$/, "").normalize("NFC");
-    const name = bare.replace(/[\u0000-\u001f\u007f/\\:*?"<>|]+/g, "-").replace(/^[\s.-]+|[\s.-]+$/g, "").slice(0, 100);
+    const name = bare
+        .replace(/[\u0000-\u001f\u007f/\\:*?"<>|]+/g, "-")
+        .replace(/^[\s.-]+|[\s.-]+$/g, "")
+        .slice(0, 100);
     const stem = name || "mesh";
     if (name === bare || (name && !taken.includes(name)))
         return name;
@@ -124,7 +143,13 @@ export async function sendMesh() {
     if (!known)
         return;
     const name = sampleName(file.name, known.samples.map((s) => s.name)), total = file.size;
-    const common = { name, format, total, unit: $select("#mesh-unit").value, material: $select("#mesh-material").value || null };
+    const common = {
+        name,
+        format,
+        total,
+        unit: $select("#mesh-unit").value,
+        material: $select("#mesh-material").value || null,
+    };
     let answer = null;
     for (let start = 0; start < total; start += CHUNK) {
         note.textContent = `${Math.round((100 * start) / total)} %`;
@@ -147,11 +172,16 @@ export async function sendMesh() {
         emit("note", "good", "Sample", `${name} is on the stage`);
 }
 const formatOf = (file) => (file.name.split(".").pop() ?? "").toLowerCase();
-$input("#mesh-file").addEventListener("change", () => { const file = $input("#mesh-file").files?.[0]; if (file)
-    $select("#mesh-unit").value = formatOf(file) === "glb" ? "m" : "mm"; });
+$input("#mesh-file").addEventListener("change", () => {
+    const file = $input("#mesh-file").files?.[0];
+    if (file)
+        $select("#mesh-unit").value = formatOf(file) === "glb" ? "m" : "mm";
+});
 // Uploads that can be deleted: the twin says why one that is in use stays.
 let uploads = [];
-const deletable = () => { $button("#sample-delete").hidden = !uploads.includes($select("#sample").value); };
+const deletable = () => {
+    $button("#sample-delete").hidden = !uploads.includes($select("#sample").value);
+};
 $select("#sample").addEventListener("change", deletable);
 async function deleteSample() {
     const name = $select("#sample").value;
@@ -165,7 +195,7 @@ export async function list() {
     const answer = await call("sample.list").catch(() => null);
     if (!answer)
         return;
-    const select = $select("#sample"), chosen = typed("sample") ? select.value : store.state?.sample.name ?? "empty";
+    const select = $select("#sample"), chosen = typed("sample") ? select.value : (store.state?.sample.name ?? "empty");
     select.textContent = "";
     for (const s of answer.samples)
         select.append(el("option", { value: s.name, title: s.description }, s.uploaded ? `${s.name} (uploaded)` : s.name));
@@ -197,15 +227,25 @@ async function predict() {
     const p = await command("exposure.predict", {}, "No prediction");
     $button("#predict").disabled = false;
     const setting = (s) => `${fixed(s.kV, 0)} kV${s.filter ? ` ${s.filter}` : ""}: ${s.cnr === null ? "saturated" : fixed(s.cnr, 1)}`;
-    const told = (p) => [`contrast to noise of ${p.detail}: ${setting(p.asked)}`, ...p.best.slice(0, 1).map((s) => `best ${setting(s)}`),
-        `1 % of the pixels see ${fixed(100 * p.transmission.p1, 1)} % or less`];
+    const told = (p) => [
+        `contrast to noise of ${p.detail}: ${setting(p.asked)}`,
+        ...p.best.slice(0, 1).map((s) => `best ${setting(s)}`),
+        `1 % of the pixels see ${fixed(100 * p.transmission.p1, 1)} % or less`,
+    ];
     $("#predicted").textContent = p ? told(p).join(" · ") : "";
     if (p)
         predicted = now;
 }
 // What a prediction was made for; it goes with that.
 let predicted = null;
-const predictable = ({ sample, tube, camera, geometry: g }) => JSON.stringify([sample, tube.kV, tube.power_W, camera, g.SOD_mm.toFixed(2), g.SDD_mm.toFixed(2)]);
+const predictable = ({ sample, tube, camera, geometry: g }) => JSON.stringify([
+    sample,
+    tube.kV,
+    tube.power_W,
+    camera,
+    g.SOD_mm.toFixed(2),
+    g.SDD_mm.toFixed(2),
+]);
 let spectrumOf = null;
 async function spectrum(kV) {
     if (spectrumOf === kV || $("#tab-setup").hidden)
@@ -213,7 +253,8 @@ async function spectrum(kV) {
     spectrumOf = kV;
     const kind = store.hello?.physics ?? "not told";
     $("#physics").textContent = kind;
-    $("#physics-note").textContent = PHYSICS[kind] ?? "This twin does not say how it makes its images.";
+    $("#physics-note").textContent =
+        PHYSICS[kind] ?? "This twin does not say how it makes its images.";
     const s = await call("viewer.spectrum", { kV }).catch(words);
     if (spectrumOf !== kV)
         return;
@@ -223,9 +264,13 @@ async function spectrum(kV) {
         $("#spectrum-note").textContent = s;
         return;
     }
-    $("#filters").textContent = s.filters.map((f) => `${fixed(f.thickness_mm, 2)} mm ${f.material.split("@")[0]}`).join(", ") || "none";
+    $("#filters").textContent =
+        s.filters
+            .map((f) => `${fixed(f.thickness_mm, 2)} mm ${f.material.split("@")[0]}`)
+            .join(", ") || "none";
     const used = kind === "ideal" ? " · not used by this physics" : "";
-    $("#spectrum-note").textContent = `${fixed(kV, 0)} kV, behind the filters · mean ${fixed(s.mean_keV, 1)} keV${used}`;
+    $("#spectrum-note").textContent =
+        `${fixed(kV, 0)} kV, behind the filters · mean ${fixed(s.mean_keV, 1)} keV${used}`;
     const most = Math.max(...s.photons), last = Math.max(kV, 1);
     x.fillStyle = getComputedStyle(canvas).getPropertyValue("--accent");
     x.beginPath();
@@ -234,16 +279,21 @@ async function spectrum(kV) {
     x.lineTo(w, h);
     x.fill();
 }
-on("tab", () => { if (store.state)
-    void spectrum(store.state.tube.kV); });
-on("session", () => { spectrumOf = null; });
+on("tab", () => {
+    if (store.state)
+        void spectrum(store.state.tube.kV);
+});
+on("session", () => {
+    spectrumOf = null;
+});
 let listed;
 on("session", list);
 on("state", show);
 function show(state) {
     if (predicted !== null && predicted !== predictable(state)) {
         predicted = null;
-        $("#predicted").textContent = "sample, beam, camera or distances have changed: predict again";
+        $("#predicted").textContent =
+            "sample, beam, camera or distances have changed: predict again";
     }
     void spectrum(state.tube.kV);
     put("kV", state.tube.kV, 2);
@@ -257,12 +307,15 @@ function show(state) {
     put("averages", c.averages);
     ROI.forEach((k, i) => put(`roi-${k}`, c.roi[i]));
     put("mode", c.mode);
-    $("#camera-shape").textContent = `${c.shape[1]} × ${c.shape[0]} px, ${fixed(c.pixel_mm * 1000, 1)} µm`;
+    $("#camera-shape").textContent =
+        `${c.shape[1]} × ${c.shape[0]} px, ${fixed(c.pixel_mm * 1000, 1)} µm`;
     const s = state.sample;
     for (const k of SIX)
         put(`off-${k}`, s.offset[k], 4);
     put("sample", s.name);
-    $("#sample-note").textContent = s.size_mm ? s.size_mm.map((v) => fixed(v, 1)).join(" × ") + " mm" : "";
+    $("#sample-note").textContent = s.size_mm
+        ? s.size_mm.map((v) => fixed(v, 1)).join(" × ") + " mm"
+        : "";
     if (listed !== s.name) {
         listed = s.name;
         void list();
@@ -270,10 +323,15 @@ function show(state) {
 }
 // What somebody wants to see is theirs alone, and this browser remembers it.
 const SHOWN = "flexdt-shown";
-const reveal = async (wanted) => { if (await command("viewer.layers", wanted))
-    keep(SHOWN, JSON.stringify({ ...store.layers, opacity: store.opacity })); };
-on("open", () => { const seen = localStorage.getItem(SHOWN); if (seen)
-    call("viewer.layers", JSON.parse(seen)).catch(() => { }); });
+const reveal = async (wanted) => {
+    if (await command("viewer.layers", wanted))
+        keep(SHOWN, JSON.stringify({ ...store.layers, opacity: store.opacity }));
+};
+on("open", () => {
+    const seen = localStorage.getItem(SHOWN);
+    if (seen)
+        call("viewer.layers", JSON.parse(seen)).catch(() => { });
+});
 // A box keeps what was chosen last until the viewer has answered: states that it sent before that are older.
 const choosing = new Map();
 async function showLayer(name, visible) {

@@ -1,5 +1,5 @@
 // The Share tab: pictures, files that open anywhere, scenes to save and load.
-import { $input, $select, bytes, chosen, clicks, download, downloadBlob, words } from "./dom.js";
+import { $input, $select, bytes, chosen, clicks, download, downloadBlob, words, } from "./dom.js";
 import { command, emit } from "./link.js";
 import { picture } from "./film.js";
 import { current } from "./views.js";
@@ -16,7 +16,7 @@ function shot() {
         return;
     }
     const [width, height] = $select("#shot-size").value.split("x").map(Number);
-    void offer("viewer.screenshot", { view: current === "four" ? "iso" : current ?? "iso", width, height }, "No picture");
+    void offer("viewer.screenshot", { view: current === "four" ? "iso" : (current ?? "iso"), width, height }, "No picture");
 }
 function film() {
     const png = picture();
@@ -34,9 +34,14 @@ async function save() {
     downloadBlob(scene, `flexdt-scene-${new Date().toISOString().slice(0, 19).replace(/[:T]/g, "-")}.json`);
 }
 clicks({
-    "shot": shot, "shot-film": film, "export-html": exported("html"), "export-viser": exported("viser"),
-    "replay-html": exported("html", true), "replay-viser": exported("viser", true),
-    "scene-save": save, "scene-load": () => $input("#scene-file").click(),
+    shot: shot,
+    "shot-film": film,
+    "export-html": exported("html"),
+    "export-viser": exported("viser"),
+    "replay-html": exported("html", true),
+    "replay-viser": exported("viser", true),
+    "scene-save": save,
+    "scene-load": () => $input("#scene-file").click(),
 });
 chosen($input("#scene-file"), async (file) => {
     try {

@@ -4,8 +4,15 @@ import { emit, on } from "./link.js";
 import { remember } from "./address.js";
 for (const name of ["move", "setup", "scan", "data", "calibrate", "share"]) {
     const words = name.charAt(0).toUpperCase() + name.slice(1);
-    $("#tabs").append(el("button", { role: "tab", id: `tab-of-${name}`, "aria-controls": `tab-${name}`, "data-tab": name, onclick: () => tab(name, true) }, words));
-    const panel = document.getElementById(`tab-${name}`) ?? el("section", { class: "tab", id: `tab-${name}`, hidden: true });
+    $("#tabs").append(el("button", {
+        role: "tab",
+        id: `tab-of-${name}`,
+        "aria-controls": `tab-${name}`,
+        "data-tab": name,
+        onclick: () => tab(name, true),
+    }, words));
+    const panel = document.getElementById(`tab-${name}`) ??
+        el("section", { class: "tab", id: `tab-${name}`, hidden: true });
     panel.setAttribute("role", "tabpanel");
     panel.setAttribute("aria-labelledby", `tab-of-${name}`);
     $("#left").append(panel);
@@ -22,7 +29,13 @@ export function tab(name, step = false) {
 }
 $("#tabs").addEventListener("keydown", (e) => {
     const all = $$("#tabs button"), i = all.indexOf(e.target), step = e.key === "ArrowRight" ? 1 : e.key === "ArrowLeft" ? -1 : 0;
-    const next = step ? all.at((i + step) % all.length) : e.key === "Home" ? all[0] : e.key === "End" ? all.at(-1) : undefined;
+    const next = step
+        ? all.at((i + step) % all.length)
+        : e.key === "Home"
+            ? all[0]
+            : e.key === "End"
+                ? all.at(-1)
+                : undefined;
     if (next) {
         e.preventDefault();
         tab(next.dataset.tab ?? "", true);

@@ -1,8 +1,11 @@
 // What a reload brings back: tab, view, data set and frame in the address, the script after its #.
 import { base64 } from "./dom.js";
 
-const MOST = 6000, DUE_MS = 300, KEY = "flexdt-script"; // a longer script stays in this browser's tab
-export const asked = (name: string): string | null => new URLSearchParams(location.search).get(name);
+const MOST = 6000,
+  DUE_MS = 300,
+  KEY = "flexdt-script"; // a longer script stays in this browser's tab
+export const asked = (name: string): string | null =>
+  new URLSearchParams(location.search).get(name);
 
 // Values of null are taken out; with `step` the browser's Back comes back to what was before.
 export function remember(values: Record<string, string | number | null>, step = false): void {
@@ -13,26 +16,38 @@ export function remember(values: Record<string, string | number | null>, step = 
   }
   if (url.href !== location.href) history[step ? "pushState" : "replaceState"](null, "", url);
 }
-const piped = (data: BlobPart, stream: ReadableWritablePair<Uint8Array<ArrayBuffer>, Uint8Array<ArrayBuffer>>) => new Response(new Blob([data]).stream().pipeThrough(stream)).arrayBuffer();
+const piped = (
+  data: BlobPart,
+  stream: ReadableWritablePair<Uint8Array<ArrayBuffer>, Uint8Array<ArrayBuffer>>,
+) => new Response(new Blob([data]).stream().pipeThrough(stream)).arrayBuffer();
 let due: number | undefined;
 export function rememberScript(text: string): void {
   clearTimeout(due);
   due = window.setTimeout(async () => {
-    const packed = base64(await piped(text, new CompressionStream("deflate-raw"))).replace(/\+/g, "-").replace(/\//g, "_").replace(/=+$/, "");
+    const packed = base64(await piped(text, new CompressionStream("deflate-raw")))
+      .replace(/\+/g, "-")
+      .replace(/\//g, "_")
+      .replace(/=+$/, "");
     const url = new URL(location.href);
     url.hash = text && packed.length <= MOST ? `script=${packed}` : "";
     history.replaceState(null, "", url.hash ? url : url.href.replace(/#$/, ""));
     try {
       if (packed.length > MOST) sessionStorage.setItem(KEY, text);
       else sessionStorage.removeItem(KEY);
-    } catch { /* it has no room */ }
+    } catch {
+      /* it has no room */
+    }
   }, DUE_MS);
 }
 export async function rememberedScript(): Promise<string> {
   const packed = location.hash.match(/^#script=([\w-]+)$/)?.[1];
   if (!packed || packed.length > MOST) return sessionStorage.getItem(KEY) ?? "";
   try {
-    const bytes = Uint8Array.from(atob(packed.replace(/-/g, "+").replace(/_/g, "/")), (c) => c.charCodeAt(0));
+    const bytes = Uint8Array.from(atob(packed.replace(/-/g, "+").replace(/_/g, "/")), (c) =>
+      c.charCodeAt(0),
+    );
     return new TextDecoder().decode(await piped(bytes, new DecompressionStream("deflate-raw")));
-  } catch { return ""; } // an address that somebody cut
+  } catch {
+    return "";
+  } // an address that somebody cut
 }

@@ -3,27 +3,95 @@ import { $, $input, $select, el, field, fixed, keep, parsed, setText, term } fro
 import type { AxisState, State } from "./viewer.js";
 import { call, command, emit, Failure, on, store } from "./link.js";
 
-const LEASE_S = 0.5, MOST_S = 10, RENEW_MS = 180, SETTLE_MS = 400;
+const LEASE_S = 0.5,
+  MOST_S = 10,
+  RENEW_MS = 180,
+  SETTLE_MS = 400;
 const GROUPS: Array<[title: string, tint: string, axes: Record<string, string>]> = [
   ["Source", "#ffb020", { ver_tube: "height", tra_tube: "sideways" }],
-  ["Sample", "#3aa0ff", { mag_obj: "to the detector", tra_obj: "sideways", ver_obj: "beam height" }],
+  [
+    "Sample",
+    "#3aa0ff",
+    { mag_obj: "to the detector", tra_obj: "sideways", ver_obj: "beam height" },
+  ],
   ["Detector", "#7a5cff", { mag_det: "distance", ver_det: "height", tra_det: "to the left" }],
 ];
 const TURN = { rot_obj: "turn of sample" }; // with what is set most
 const JOG_FALLBACK = { mm: 50, deg: 45 };
 interface Row {
-  name: string; box: HTMLElement; slider: HTMLInputElement; number: HTMLInputElement; now: HTMLElement;
-  low: number; high: number; from: number; to: number; turn: number; dragging: boolean; asked: number; waiting: number;
+  name: string;
+  box: HTMLElement;
+  slider: HTMLInputElement;
+  number: HTMLInputElement;
+  now: HTMLElement;
+  low: number;
+  high: number;
+  from: number;
+  to: number;
+  turn: number;
+  dragging: boolean;
+  asked: number;
+  waiting: number;
 }
 // What a scan is planned by; setting one moves motors by as much. Only a machine with all of them has it.
-interface Main { words: string; unit: string; digits: number; tip: string; now: (s: State) => number; axes: string[]; shift: (s: State, v: number) => number }
-const sod = (s: State) => s.geometry.SOD_mm, sdd = (s: State) => s.geometry.SDD_mm, high = () => store.framing?.sample_height_mm ?? NaN;
+interface Main {
+  words: string;
+  unit: string;
+  digits: number;
+  tip: string;
+  now: (s: State) => number;
+  axes: string[];
+  shift: (s: State, v: number) => number;
+}
+const sod = (s: State) => s.geometry.SOD_mm,
+  sdd = (s: State) => s.geometry.SDD_mm,
+  high = () => store.framing?.sample_height_mm ?? NaN;
 const MAINS: Main[] = [
-  { words: "Source to sample", unit: "mm", digits: 2, tip: "SOD: from the focal spot to the rotation axis, along the beam. Setting it moves the sample.", now: sod, axes: ["mag_obj"], shift: (s, v) => v - sod(s) },
-  { words: "Source to detector", unit: "mm", digits: 2, tip: "SDD: from the focal spot to the panel. Setting it moves the detector.", now: sdd, axes: ["mag_det"], shift: (s, v) => v - sdd(s) },
-  { words: "Magnification", unit: "×", digits: 3, tip: "How much larger the sample is on the panel: SDD / SOD. Setting it moves the sample.", now: (s) => s.geometry.magnification, axes: ["mag_obj"], shift: (s, v) => sdd(s) / v - sod(s) },
-  { words: "Voxel size", unit: "µm", digits: 2, tip: "A pixel of the image, as large as it is at the sample: pixel / magnification. Setting it moves the sample.", now: (s) => 1000 * s.geometry.voxel_size_mm, axes: ["mag_obj"], shift: (s, v) => sod(s) * (v / (1000 * s.geometry.voxel_size_mm) - 1) },
-  { words: "Sample above beam", unit: "mm", digits: 2, tip: "Height of the sample's reference point above the focal spot. Setting it moves source and detector together.", now: high, axes: ["ver_tube", "ver_det"], shift: (_, v) => high() - v },
+  {
+    words: "Source to sample",
+    unit: "mm",
+    digits: 2,
+    tip: "SOD: from the focal spot to the rotation axis, along the beam. Setting it moves the sample.",
+    now: sod,
+    axes: ["mag_obj"],
+    shift: (s, v) => v - sod(s),
+  },
+  {
+    words: "Source to detector",
+    unit: "mm",
+    digits: 2,
+    tip: "SDD: from the focal spot to the panel. Setting it moves the detector.",
+    now: sdd,
+    axes: ["mag_det"],
+    shift: (s, v) => v - sdd(s),
+  },
+  {
+    words: "Magnification",
+    unit: "×",
+    digits: 3,
+    tip: "How much larger the sample is on the panel: SDD / SOD. Setting it moves the sample.",
+    now: (s) => s.geometry.magnification,
+    axes: ["mag_obj"],
+    shift: (s, v) => sdd(s) / v - sod(s),
+  },
+  {
+    words: "Voxel size",
+    unit: "µm",
+    digits: 2,
+    tip: "A pixel of the image, as large as it is at the sample: pixel / magnification. Setting it moves the sample.",
+    now: (s) => 1000 * s.geometry.voxel_size_mm,
+    axes: ["mag_obj"],
+    shift: (s, v) => sod(s) * (v / (1000 * s.geometry.voxel_size_mm) - 1),
+  },
+  {
+    words: "Sample above beam",
+    unit: "mm",
+    digits: 2,
+    tip: "Height of the sample's reference point above the focal spot. Setting it moves source and detector together.",
+    now: high,
+    axes: ["ver_tube", "ver_det"],
+    shift: (_, v) => high() - v,
+  },
 ];
 const mains: Array<[main: Main, field: HTMLInputElement]> = [];
 const rows = new Map<string, Row>();
@@ -32,16 +100,21 @@ const held = new Map<string, { axis: string; timer: number }>();
 export function jogStart(axis: string, direction: number, token: string): void {
   if (held.has(token)) return;
   const renew = () => {
-    const all = store.state, state = all?.axes[axis];
+    const all = store.state,
+      state = all?.axes[axis];
     if (!all || !state) return;
     // The lease runs on the twin's clock, the renewals on ours.
-    const pace = all.clock.speed_up, lease = Math.min(MOST_S, LEASE_S * Math.max(1, Number(pace) || 1));
+    const pace = all.clock.speed_up,
+      lease = Math.min(MOST_S, LEASE_S * Math.max(1, Number(pace) || 1));
     const top = state.speed ?? JOG_FALLBACK[state.unit];
     const velocity = direction * top * Number($select("#jog-speed").value);
-    void command("axes.jog", { axis, velocity, lease_s: lease }, `Cannot jog ${axis}`).then((answer) => {
-      // Refused once is enough said: it stops without a second note.
-      if (answer === null && drop(token)) call("axes.jog", { axis, velocity: 0 }).catch(() => {});
-    });
+    void command("axes.jog", { axis, velocity, lease_s: lease }, `Cannot jog ${axis}`).then(
+      (answer) => {
+        // Refused once is enough said: it stops without a second note.
+        if (answer === null && drop(token))
+          call("axes.jog", { axis, velocity: 0 }).catch(() => {});
+      },
+    );
   };
   held.set(token, { axis, timer: window.setInterval(renew, RENEW_MS) });
   renew();
@@ -54,13 +127,19 @@ function drop(token: string) {
 }
 export function jogStop(token: string): void {
   const hold = drop(token);
-  if (hold) void command("axes.jog", { axis: hold.axis, velocity: 0 }, `Cannot stop ${hold.axis}`);
+  if (hold)
+    void command("axes.jog", { axis: hold.axis, velocity: 0 }, `Cannot stop ${hold.axis}`);
 }
-export function jogStopAll(): void { for (const token of [...held.keys()]) jogStop(token); }
+export function jogStopAll(): void {
+  for (const token of [...held.keys()]) jogStop(token);
+}
 
 // What came of a refused move, in a few words.
 function title(axis: string, error: unknown) {
-  const halts = (error instanceof Failure ? (error.data as { halts_at?: Record<string, number> } | null)?.halts_at : null) ?? {};
+  const halts =
+    (error instanceof Failure
+      ? (error.data as { halts_at?: Record<string, number> } | null)?.halts_at
+      : null) ?? {};
   if (axis in halts) return `${axis} goes to ${fixed(halts[axis], 2)} and halts there`;
   return Object.keys(halts).length ? `${axis} halts on its way` : `${axis} does not move`;
 }
@@ -68,7 +147,11 @@ function title(axis: string, error: unknown) {
 // Whether the axes were sent there; the first one names them.
 async function send(targets: Record<string, number>) {
   const [axis] = Object.keys(targets);
-  const answer = await command("axes.move", { targets, plan: $input("#around").checked }, (error) => title(axis, error));
+  const answer = await command(
+    "axes.move",
+    { targets, plan: $input("#around").checked },
+    (error) => title(axis, error),
+  );
   for (const warning of answer?.warnings ?? []) emit("note", "warning-note", axis, warning);
   return answer !== null;
 }
@@ -78,15 +161,29 @@ function mainRow(main: Main, state: State) {
   if (axes.some((name) => !(name in state.axes))) return [];
   const input = field({ "aria-label": words }, enter, () => input.blur());
   function enter() {
-    const text = input.value, value = parsed(text), s = store.state;
+    const text = input.value,
+      value = parsed(text),
+      s = store.state;
     input.blur();
-    if (!s || !(value > 0 || (axes.length > 1 && Number.isFinite(value)))) { emit("note", "error", `${words} stays`, `“${text}” is not a number above 0`); return; }
+    if (!s || !(value > 0 || (axes.length > 1 && Number.isFinite(value)))) {
+      emit("note", "error", `${words} stays`, `“${text}” is not a number above 0`);
+      return;
+    }
     const by = shift(s, value);
     void send(Object.fromEntries(axes.map((name) => [name, s.axes[name].position + by])));
   }
-  input.addEventListener("blur", () => { if (store.state) drawMains(store.state); });
+  input.addEventListener("blur", () => {
+    if (store.state) drawMains(store.state);
+  });
   mains.push([main, input]);
-  return [el("div", { class: "main-row" }, term(words, tip), el("span", {}, input, el("span", { class: "unit" }, unit)))];
+  return [
+    el(
+      "div",
+      { class: "main-row" },
+      term(words, tip),
+      el("span", {}, input, el("span", { class: "unit" }, unit)),
+    ),
+  ];
 }
 function drawMains(state: State) {
   for (const [{ now, digits }, input] of mains) {
@@ -99,57 +196,146 @@ function drawMains(state: State) {
 
 function jogButton(axis: string, direction: number, sign: string) {
   const token = `${axis}:${direction}`;
-  const button = el("button", { "data-jog": token, title: `Hold to jog ${axis} (or hold Enter)`, "aria-label": `jog ${axis} ${direction > 0 ? "up" : "down"}` }, sign);
-  const stop = () => { button.classList.remove("held"); jogStop(token); };
-  const start = () => { button.classList.add("held"); jogStart(axis, direction, token); };
-  button.addEventListener("pointerdown", (e) => { e.preventDefault(); button.setPointerCapture(e.pointerId); start(); });
-  button.addEventListener("keydown", (e) => { if (e.key === "Enter" && !e.repeat) start(); });
-  button.addEventListener("keyup", (e) => { if (e.key === "Enter") stop(); });
-  for (const name of ["pointerup", "pointercancel", "lostpointercapture", "blur"]) button.addEventListener(name, stop);
+  const button = el(
+    "button",
+    {
+      "data-jog": token,
+      title: `Hold to jog ${axis} (or hold Enter)`,
+      "aria-label": `jog ${axis} ${direction > 0 ? "up" : "down"}`,
+    },
+    sign,
+  );
+  const stop = () => {
+    button.classList.remove("held");
+    jogStop(token);
+  };
+  const start = () => {
+    button.classList.add("held");
+    jogStart(axis, direction, token);
+  };
+  button.addEventListener("pointerdown", (e) => {
+    e.preventDefault();
+    button.setPointerCapture(e.pointerId);
+    start();
+  });
+  button.addEventListener("keydown", (e) => {
+    if (e.key === "Enter" && !e.repeat) start();
+  });
+  button.addEventListener("keyup", (e) => {
+    if (e.key === "Enter") stop();
+  });
+  for (const name of ["pointerup", "pointercancel", "lostpointercapture", "blur"])
+    button.addEventListener(name, stop);
   return button;
 }
 
 function build(state: State) {
-  const others = Object.keys(state.axes).filter((name) => !(name in TURN) && !GROUPS.some(([, , axes]) => name in axes));
-  const box = $("#axes"); box.textContent = ""; rows.clear(); mains.length = 0;
-  const turn = Object.entries(TURN).filter(([name]) => name in state.axes).map(([name, what]) => axisRow(name, state.axes[name], what));
+  const others = Object.keys(state.axes).filter(
+    (name) => !(name in TURN) && !GROUPS.some(([, , axes]) => name in axes),
+  );
+  const box = $("#axes");
+  box.textContent = "";
+  rows.clear();
+  mains.length = 0;
+  const turn = Object.entries(TURN)
+    .filter(([name]) => name in state.axes)
+    .map(([name, what]) => axisRow(name, state.axes[name], what));
   $("#mains").replaceChildren(...MAINS.flatMap((main) => mainRow(main, state)), ...turn);
-  for (const [title, tint, axes] of [...GROUPS, ["Others", "#999", Object.fromEntries(others.map((name) => [name, ""]))] as const]) {
-    const found = Object.entries(axes).filter(([name]) => name in state.axes).map(([name, what]) => axisRow(name, state.axes[name], what));
-    if (found.length) box.append(el("div", { class: "group", style: `--tint:${tint}` }, el("h2", {}, title), ...found));
+  for (const [title, tint, axes] of [
+    ...GROUPS,
+    ["Others", "#999", Object.fromEntries(others.map((name) => [name, ""]))] as const,
+  ]) {
+    const found = Object.entries(axes)
+      .filter(([name]) => name in state.axes)
+      .map(([name, what]) => axisRow(name, state.axes[name], what));
+    if (found.length)
+      box.append(
+        el("div", { class: "group", style: `--tint:${tint}` }, el("h2", {}, title), ...found),
+      );
   }
 }
 
 function axisRow(name: string, axis: AxisState, what: string) {
   const [low, high] = axis.limits;
-  const slider = el("input", { type: "range", min: low, max: high, step: 0.1, value: axis.target, "aria-label": `${name} slider` });
+  const slider = el("input", {
+    type: "range",
+    min: low,
+    max: high,
+    step: 0.1,
+    value: axis.target,
+    "aria-label": `${name} slider`,
+  });
   const number = field({ "aria-label": `${name} value` }, enter, () => number.blur());
   const now = el("span", { class: "now" });
   const box = el("div", { class: "axis", "data-axis": name });
-  const row: Row = { name, box, slider, number, now, low, high, from: low, to: high, turn: NaN, dragging: false, asked: 0, waiting: 0 };
+  const row: Row = {
+    name,
+    box,
+    slider,
+    number,
+    now,
+    low,
+    high,
+    from: low,
+    to: high,
+    turn: NaN,
+    dragging: false,
+    asked: 0,
+    waiting: 0,
+  };
   function enter() {
-    const text = number.value, value = parsed(text);
+    const text = number.value,
+      value = parsed(text);
     number.blur();
     if (Number.isFinite(value)) void move(name, value);
     else emit("note", "error", `${name} does not move`, `“${text}” is not a number`);
   }
   number.addEventListener("blur", () => draw(row));
-  const letGo = () => setTimeout(() => { row.dragging = false; draw(row); }); // after the change, if there is one
-  slider.addEventListener("input", () => { row.dragging = true; number.value = fixed(Number(slider.value), 3); number.classList.add("typed"); });
-  for (const event of ["pointerup", "pointercancel", "blur"]) slider.addEventListener(event, letGo);
+  const letGo = () =>
+    setTimeout(() => {
+      row.dragging = false;
+      draw(row);
+    }); // after the change, if there is one
+  slider.addEventListener("input", () => {
+    row.dragging = true;
+    number.value = fixed(Number(slider.value), 3);
+    number.classList.add("typed");
+  });
+  for (const event of ["pointerup", "pointercancel", "blur"])
+    slider.addEventListener(event, letGo);
   const slid = async () => {
     row.dragging = false;
-    const mine = row.waiting = ++row.asked;
+    const mine = (row.waiting = ++row.asked);
     // The state that shows the motion may come a little after the answer.
     const wait = (await move(name, Number(slider.value))) ? SETTLE_MS : 0;
-    setTimeout(() => { if (row.waiting === mine) { row.waiting = 0; draw(row); } }, wait);
+    setTimeout(() => {
+      if (row.waiting === mine) {
+        row.waiting = 0;
+        draw(row);
+      }
+    }, wait);
   };
   slider.addEventListener("change", () => void slid());
   box.append(
-    el("div", { class: "top" },
-      el("span", { title: what }, el("span", { class: "name" }, name), el("span", { class: "what" }, what)),
-      el("span", {}, number, el("span", { class: "unit" }, axis.unit === "deg" ? "°" : "mm"))),
-    el("div", { class: "line" }, jogButton(name, -1, "−"), el("div", { class: "track" }, slider, now), jogButton(name, 1, "+")));
+    el(
+      "div",
+      { class: "top" },
+      el(
+        "span",
+        { title: what },
+        el("span", { class: "name" }, name),
+        el("span", { class: "what" }, what),
+      ),
+      el("span", {}, number, el("span", { class: "unit" }, axis.unit === "deg" ? "°" : "mm")),
+    ),
+    el(
+      "div",
+      { class: "line" },
+      jogButton(name, -1, "−"),
+      el("div", { class: "track" }, slider, now),
+      jogButton(name, 1, "+"),
+    ),
+  );
   rows.set(name, row);
   return box;
 }
@@ -157,9 +343,16 @@ function axisRow(name: string, axis: AxisState, what: string) {
 // What the chosen speed is of those axes.
 function pace(state: State) {
   const of = (unit: AxisState["unit"]) => {
-    const all = Object.values(state.axes).filter((a) => a.unit === unit && !a.virtual).map((a) => (a.speed ?? JOG_FALLBACK[unit]) * Number($select("#jog-speed").value));
-    const low = Math.min(...all), high = Math.max(...all);
-    return all.length ? [`${low === high ? fixed(low, 1) : `${fixed(low, 1)} to ${fixed(high, 1)}`} ${unit === "deg" ? "°/s" : "mm/s"}`] : [];
+    const all = Object.values(state.axes)
+      .filter((a) => a.unit === unit && !a.virtual)
+      .map((a) => (a.speed ?? JOG_FALLBACK[unit]) * Number($select("#jog-speed").value));
+    const low = Math.min(...all),
+      high = Math.max(...all);
+    return all.length
+      ? [
+          `${low === high ? fixed(low, 1) : `${fixed(low, 1)} to ${fixed(high, 1)}`} ${unit === "deg" ? "°/s" : "mm/s"}`,
+        ]
+      : [];
   };
   setText($("#jog-is"), [...of("mm"), ...of("deg")].join(", "));
 }
@@ -170,7 +363,8 @@ function refresh(state: State) {
   drawMains(state);
 }
 // Motors are one level below; this browser remembers whether they are open.
-const motors = $<HTMLDetailsElement>("#motors"), MOTORS = "flexdt-motors";
+const motors = $<HTMLDetailsElement>("#motors"),
+  MOTORS = "flexdt-motors";
 motors.open = localStorage.getItem(MOTORS) === "open";
 motors.addEventListener("toggle", () => keep(MOTORS, motors.open ? "open" : "closed"));
 
@@ -178,8 +372,10 @@ motors.addEventListener("toggle", () => keep(MOTORS, motors.open ? "open" : "clo
 function turned(row: Row, position: number) {
   if (Math.abs(position - row.turn) <= 180) return;
   row.turn = 360 * Math.round(position / 360);
-  row.from = Math.max(row.low, row.turn - 180); row.to = Math.min(row.high, row.turn + 180);
-  row.slider.min = String(row.from); row.slider.max = String(row.to);
+  row.from = Math.max(row.low, row.turn - 180);
+  row.to = Math.min(row.high, row.turn + 180);
+  row.slider.min = String(row.from);
+  row.slider.max = String(row.to);
   row.slider.title = `${row.from}° to ${row.to}°; the number takes all turns`;
 }
 
@@ -197,8 +393,13 @@ function draw(row: Row) {
   const at = (axis.position - row.from) / (row.to - row.from);
   row.now.style.left = `calc(8px + (100% - 16px) * ${Math.min(1, Math.max(0, at)).toFixed(4)})`;
   row.box.classList.toggle("moving", axis.moving);
-  row.box.classList.toggle("limit", !axis.moving && (axis.position - row.low < 0.5 || row.high - axis.position < 0.5));
+  row.box.classList.toggle(
+    "limit",
+    !axis.moving && (axis.position - row.low < 0.5 || row.high - axis.position < 0.5),
+  );
 }
 
 on("state", refresh);
-on("connection", () => { if (!store.viewer || !store.twin) for (const token of [...held.keys()]) drop(token); });
+on("connection", () => {
+  if (!store.viewer || !store.twin) for (const token of [...held.keys()]) drop(token);
+});

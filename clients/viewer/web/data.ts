@@ -1,34 +1,132 @@
 // The Data tab: a browser of data sets; one that is open goes through its images, radiograph and machine together.
-import { $, $$, $button, $dialog, $input, $select, clicks, el, fixed, putImage, seconds, setText, slid, within, words } from "./dom.js";
+import {
+  $,
+  $$,
+  $button,
+  $dialog,
+  $input,
+  $select,
+  clicks,
+  el,
+  fixed,
+  putImage,
+  seconds,
+  setText,
+  slid,
+  within,
+  words,
+} from "./dom.js";
 import { call, command, emit, on, store } from "./link.js";
 import { asked, remember } from "./address.js";
-import type { AboutImage, DatasetInfo, DatasetResult, ImageValue, JobStatus, Kind } from "./viewer.js";
+import type {
+  AboutImage,
+  DatasetInfo,
+  DatasetResult,
+  ImageValue,
+  JobStatus,
+  Kind,
+} from "./viewer.js";
 import { draw as drawTimeline, type Lanes } from "./timeline.js";
 import { offer } from "./share.js";
 import * as compare from "./compare.js";
 import * as marks from "./marks.js";
 
-const SEARCH_MS = 250, AGAIN_MS = 500, PLAYED = 300, LEAST_MS = 60, LEAST_PX = 76;
-const WORDS: Record<DatasetInfo["state"], string> = { complete: "complete", incomplete: "incomplete", running: "running", unknown: "cannot be read in full" };
+const SEARCH_MS = 250,
+  AGAIN_MS = 500,
+  PLAYED = 300,
+  LEAST_MS = 60,
+  LEAST_PX = 76;
+const WORDS: Record<DatasetInfo["state"], string> = {
+  complete: "complete",
+  incomplete: "incomplete",
+  running: "running",
+  unknown: "cannot be read in full",
+};
 // What is open: as it was told first, and once more when it had been measured (at fewer places).
 type Opened = DatasetResult & { whole?: DatasetResult };
-let listed: DatasetInfo[] = [], told: Opened | null = null, plan: Lanes | null = null, index = 0, next: number | null = null, asking = false, playing = false, number = 0;
+let listed: DatasetInfo[] = [],
+  told: Opened | null = null,
+  plan: Lanes | null = null,
+  index = 0,
+  next: number | null = null,
+  asking = false,
+  playing = false,
+  number = 0;
 
 const search = $input("#data-search");
 clicks({ "data-more": () => list(listed.length) });
-const slider: HTMLInputElement = el("input", { type: "range", id: "record-frame", min: 0, step: 1, value: 0, "aria-label": "Image", oninput: () => show(Number(slider.value)) });
-const canvas = el("canvas", { id: "record-line", role: "img", "aria-label": "Motors, clearance and counts over time" });
-const button = (id: string, text: string, title: string, f: () => unknown) => el("button", { id, class: "small", title, onclick: f }, text);
-const panel = el("div", { id: "record", hidden: true },
-  el("div", { class: "row head" }, el("b", { id: "record-name", class: "cut" }), el("span", { id: "record-state", class: "muted cut" }), el("span", { class: "spacer" }),
-    button("record-fit", "Calibrate", "Calibrate from this data set: its sample is the phantom", () => { if (told) emit("calibrate", told.info.name, told.info.sample); }),
-    button("record-align", "Align", "Find the axis of this scan without a phantom", () => { if (told) emit("align", told.info.name); }),
-    button("record-volume", "Reconstruct", "Its volume, as flexdt reconstruct makes it", () => { if (told) emit("reconstruct", told.info.name); }),
-    button("record-script", "Script", "Bring its script into the Scan tab", script), button("record-replay", "Replay file", "This scan as one HTML file that plays it", () => offer("viewer.export", { format: "html", replay: true }, "No replay")),
-    button("record-close", "Close", "Back to what is live (Escape)", () => open(null, null, true))),
-  el("div", { class: "row head" }, button("record-play", "▶", "Play", () => play(!playing)), button("record-back", "‹", "The image before", () => show(index - 1)),
-    slider, button("record-next", "›", "The next image", () => show(index + 1)), el("span", { id: "record-at", class: "mono small-text cut" })),
-  compare.row, marks.row((all) => { if (told) emit("calibrate", told.info.name, told.info.sample, all); }), el("div", { class: "lanes", tabIndex: 0, role: "group", "aria-label": "Motors, clearance and counts" }, canvas), el("div", { id: "record-note", class: "muted small-text cut" }));
+const slider: HTMLInputElement = el("input", {
+  type: "range",
+  id: "record-frame",
+  min: 0,
+  step: 1,
+  value: 0,
+  "aria-label": "Image",
+  oninput: () => show(Number(slider.value)),
+});
+const canvas = el("canvas", {
+  id: "record-line",
+  role: "img",
+  "aria-label": "Motors, clearance and counts over time",
+});
+const button = (id: string, text: string, title: string, f: () => unknown) =>
+  el("button", { id, class: "small", title, onclick: f }, text);
+const panel = el(
+  "div",
+  { id: "record", hidden: true },
+  el(
+    "div",
+    { class: "row head" },
+    el("b", { id: "record-name", class: "cut" }),
+    el("span", { id: "record-state", class: "muted cut" }),
+    el("span", { class: "spacer" }),
+    button(
+      "record-fit",
+      "Calibrate",
+      "Calibrate from this data set: its sample is the phantom",
+      () => {
+        if (told) emit("calibrate", told.info.name, told.info.sample);
+      },
+    ),
+    button("record-align", "Align", "Find the axis of this scan without a phantom", () => {
+      if (told) emit("align", told.info.name);
+    }),
+    button("record-volume", "Reconstruct", "Its volume, as flexdt reconstruct makes it", () => {
+      if (told) emit("reconstruct", told.info.name);
+    }),
+    button("record-script", "Script", "Bring its script into the Scan tab", script),
+    button("record-replay", "Replay file", "This scan as one HTML file that plays it", () =>
+      offer("viewer.export", { format: "html", replay: true }, "No replay"),
+    ),
+    button("record-close", "Close", "Back to what is live (Escape)", () =>
+      open(null, null, true),
+    ),
+  ),
+  el(
+    "div",
+    { class: "row head" },
+    button("record-play", "▶", "Play", () => play(!playing)),
+    button("record-back", "‹", "The image before", () => show(index - 1)),
+    slider,
+    button("record-next", "›", "The next image", () => show(index + 1)),
+    el("span", { id: "record-at", class: "mono small-text cut" }),
+  ),
+  compare.row,
+  marks.row((all) => {
+    if (told) emit("calibrate", told.info.name, told.info.sample, all);
+  }),
+  el(
+    "div",
+    {
+      class: "lanes",
+      tabIndex: 0,
+      role: "group",
+      "aria-label": "Motors, clearance and counts",
+    },
+    canvas,
+  ),
+  el("div", { id: "record-note", class: "muted small-text cut" }),
+);
 $("#stage").append(panel);
 
 // Thumbnails come as 8-bit grey.
@@ -36,73 +134,157 @@ function thumbnail(small: ImageValue | null) {
   const c = el("canvas", { width: 1, height: 1 });
   return small ? putImage(c, small) : c;
 }
-const dated = (info: DatasetInfo) => (info.started ? info.started.slice(0, 16).replace("T", " ") : new Date(1000 * info.modified).toISOString().slice(0, 16).replace("T", " "));
+const dated = (info: DatasetInfo) =>
+  info.started
+    ? info.started.slice(0, 16).replace("T", " ")
+    : new Date(1000 * info.modified).toISOString().slice(0, 16).replace("T", " ");
 function settings(info: DatasetInfo) {
-  const frames = info.present < info.projections ? `${info.present} of ${info.projections} projections` : `${info.projections} projections`;
+  const frames =
+    info.present < info.projections
+      ? `${info.present} of ${info.projections} projections`
+      : `${info.projections} projections`;
   const beam = info.kV === null ? null : `${fixed(info.kV, 0)} kV ${fixed(info.power_W, 0)} W`;
-  return [frames, beam, info.exposure_ms === null ? null : `${fixed(info.exposure_ms, 0)} ms`, info.sample || null].filter(Boolean).join(" · ");
+  return [
+    frames,
+    beam,
+    info.exposure_ms === null ? null : `${fixed(info.exposure_ms, 0)} ms`,
+    info.sample || null,
+  ]
+    .filter(Boolean)
+    .join(" · ");
 }
 function row(info: DatasetInfo) {
   const why = info.problem || info.reason;
-  const node = el("button", { class: "data-set", "data-name": info.name, title: why, onclick: () => open(info.name, null, true) }, thumbnail(info.thumbnail),
-    el("span", {}, el("b", {}, info.name), el("span", { class: "muted" }, dated(info)), el("span", {}, settings(info)),
-      el("span", { class: `state ${info.state}` }, info.state === "incomplete" && why ? `incomplete: ${why}` : info.state === "unknown" && why ? why : WORDS[info.state])));
+  const node = el(
+    "button",
+    {
+      class: "data-set",
+      "data-name": info.name,
+      title: why,
+      onclick: () => open(info.name, null, true),
+    },
+    thumbnail(info.thumbnail),
+    el(
+      "span",
+      {},
+      el("b", {}, info.name),
+      el("span", { class: "muted" }, dated(info)),
+      el("span", {}, settings(info)),
+      el(
+        "span",
+        { class: `state ${info.state}` },
+        info.state === "incomplete" && why
+          ? `incomplete: ${why}`
+          : info.state === "unknown" && why
+            ? why
+            : WORDS[info.state],
+      ),
+    ),
+  );
   node.setAttribute("aria-current", String(info.name === told?.info.name));
   return node;
 }
 async function list(start = 0) {
   const mine = ++number;
-  const answer = await call("viewer.datasets", { search: search.value.trim().slice(0, 200), start }).catch(words);
+  const answer = await call("viewer.datasets", {
+    search: search.value.trim().slice(0, 200),
+    start,
+  }).catch(words);
   if (mine !== number) return;
-  if (typeof answer === "string") { setText($("#data-count"), answer); return; }
+  if (typeof answer === "string") {
+    setText($("#data-count"), answer);
+    return;
+  }
   listed = [...(start ? listed : []), ...answer.datasets];
   const key = JSON.stringify(listed);
   if (key !== drawn) $("#data-list").replaceChildren(...listed.map(row)); // a click is lost with its row
   drawn = key;
   $button("#data-more").hidden = listed.length >= answer.total;
   const left = answer.left_out ? ` · ${answer.left_out} folders left out` : "";
-  const none = search.value ? "none is found" : "none yet: run a scan", all = answer.total ? `${listed.length} of ${answer.total}${left}` : none;
-  setText($("#data-count"), answer.unread ? `${answer.total} data sets · reading ${answer.unread} more …` : all);
-  if (answer.unread && !$("#tab-data").hidden) setTimeout(() => { if (mine === number) void list(); }, AGAIN_MS);
+  const none = search.value ? "none is found" : "none yet: run a scan",
+    all = answer.total ? `${listed.length} of ${answer.total}${left}` : none;
+  setText(
+    $("#data-count"),
+    answer.unread ? `${answer.total} data sets · reading ${answer.unread} more …` : all,
+  );
+  if (answer.unread && !$("#tab-data").hidden)
+    setTimeout(() => {
+      if (mine === number) void list();
+    }, AGAIN_MS);
 }
-let typing: number | undefined, drawn = "";
-function listSoon() { clearTimeout(typing); typing = window.setTimeout(list, SEARCH_MS); }
+let typing: number | undefined,
+  drawn = "";
+function listSoon() {
+  clearTimeout(typing);
+  typing = window.setTimeout(list, SEARCH_MS);
+}
 search.addEventListener("input", listSoon);
-on("tab", (tab) => { if (tab === "data" && store.session) void list(); });
-on("session", () => { if (!$("#tab-data").hidden) void list(); });
-export const folder = (job: JobStatus | null): string => (job?.dataset ?? "").split(/[\\/]/).pop() || "?";
+on("tab", (tab) => {
+  if (tab === "data" && store.session) void list();
+});
+on("session", () => {
+  if (!$("#tab-data").hidden) void list();
+});
+export const folder = (job: JobStatus | null): string =>
+  (job?.dataset ?? "").split(/[\\/]/).pop() || "?";
 on("job", (job) => {
   if (!$("#tab-data").hidden) listSoon();
   // Open while it was scanned: now it has more images, or all.
-  if (told?.info.state === "running" && folder(job) === told.info.name && !["queued", "running", "paused"].includes(job.state)) void open(told.info.name, index);
+  if (
+    told?.info.state === "running" &&
+    folder(job) === told.info.name &&
+    !["queued", "running", "paused"].includes(job.state)
+  )
+    void open(told.info.name, index);
 });
 
 // Opens a data set at an image, or closes the one that is open (null).
-export async function open(name: string | null, at: number | null = null, step = false): Promise<void> {
-  void play(false); next = null;
+export async function open(
+  name: string | null,
+  at: number | null = null,
+  step = false,
+): Promise<void> {
+  void play(false);
+  next = null;
   const mine = ++opening;
-  const answer = name === null ? await call("viewer.recorded", { name }).catch(() => null) : await command("viewer.recorded", { name }, `${name} cannot be opened`);
+  const answer =
+    name === null
+      ? await call("viewer.recorded", { name }).catch(() => null)
+      : await command("viewer.recorded", { name }, `${name} cannot be opened`);
   if (mine !== opening || (name !== null && !answer)) return;
-  told = name === null ? null : answer; plan = null;
-  store.recorded = name; store.hidden = false; store.image = null; emit("image");
+  told = name === null ? null : answer;
+  plan = null;
+  store.recorded = name;
+  store.hidden = false;
+  store.image = null;
+  emit("image");
   panel.hidden = told === null;
   $("#stage").classList.toggle("recorded", told !== null);
-  for (const node of $$("#data-list > *")) node.setAttribute("aria-current", String(node.dataset.name === name));
+  for (const node of $$("#data-list > *"))
+    node.setAttribute("aria-current", String(node.dataset.name === name));
   clearTimeout(kept);
   remember({ data: name, frame: at }, step);
   emit("recorded", name);
   if (name === null || !told) return;
-  const i = told.info, bare = !told.times_s;
+  const i = told.info,
+    bare = !told.times_s;
   setText($("#record-name"), i.name);
-  setText($("#record-state"), `${WORDS[i.state]}${i.problem || i.reason ? `: ${i.problem || i.reason}` : ""} · ${settings(i)}${i.duration_s ? ` · ${seconds(i.duration_s)}` : ""}`);
+  setText(
+    $("#record-state"),
+    `${WORDS[i.state]}${i.problem || i.reason ? `: ${i.problem || i.reason}` : ""} · ${settings(i)}${i.duration_s ? ` · ${seconds(i.duration_s)}` : ""}`,
+  );
   $("#record-state").title = $("#record-state").textContent;
-  compare.allow(told.same_machine ? "" : "not this twin’s machine and zeros, or poses that are not known");
+  compare.allow(
+    told.same_machine ? "" : "not this twin’s machine and zeros, or poses that are not known",
+  );
   $button("#record-replay").disabled = bare || !told.same_machine;
   slider.max = String(Math.max(0, told.images - 1));
   setText($("#record-note"), note());
   lanes();
   await show(Math.min(Math.max(0, at ?? told.kinds.indexOf("projection")), told.images - 1));
-  const measured = await call("dataset.get", { name, points: 400, measure: true }).catch(() => null);
+  const measured = await call("dataset.get", { name, points: 400, measure: true }).catch(
+    () => null,
+  );
   if (mine !== opening || !measured) return;
   told = { ...measured, whole: told };
   setText($("#record-note"), note());
@@ -112,33 +294,70 @@ let opening = 0;
 function note() {
   if (!told) return "";
   const parts: string[] = [];
-  if (!Object.keys(told.positions).length) parts.push("poses and times are not known: only images are shown");
-  else if (!told.same_machine) parts.push("another machine or other zeros than this twin's: its pose is not drawn in the scene");
+  if (!Object.keys(told.positions).length)
+    parts.push("poses and times are not known: only images are shown");
+  else if (!told.same_machine)
+    parts.push(
+      "another machine or other zeros than this twin's: its pose is not drawn in the scene",
+    );
   if (compare.how() !== "recorded") {
     const { sample, correction } = store.state ?? {};
-    const other = sample?.name === told.info.sample ? "" : ` (the scan says ${told.info.sample || "nothing of its sample"})`;
-    parts.push(`virtual: ${sample?.name || "empty stage"}${other}, ${correction ? `correction ${correction.name}` : "nominal geometry"}`);
+    const other =
+      sample?.name === told.info.sample
+        ? ""
+        : ` (the scan says ${told.info.sample || "nothing of its sample"})`;
+    parts.push(
+      `virtual: ${sample?.name || "empty stage"}${other}, ${correction ? `correction ${correction.name}` : "nominal geometry"}`,
+    );
   }
   if (told.clearance_of) parts.push(`clearance: ${told.clearance_of}`);
-  parts.push(told.counts === null ? "measuring counts and clearances …" : told.counts.some((c) => c === null) ? "gaps: images that cannot be read" : "");
+  parts.push(
+    told.counts === null
+      ? "measuring counts and clearances …"
+      : told.counts.some((c) => c === null)
+        ? "gaps: images that cannot be read"
+        : "",
+  );
   return parts.filter(Boolean).join(" · ");
 }
 function lanes() {
   if (!told) return;
-  const { kinds } = told, times = told.times_s ?? told.indices, curves: Lanes["curves"] = {}, units: Lanes["units"] = {};
+  const { kinds } = told,
+    times = told.times_s ?? told.indices,
+    curves: Lanes["curves"] = {},
+    units: Lanes["units"] = {};
   for (const [name, values] of Object.entries(told.positions)) {
-    const known = values.filter((v) => v !== null), moves = known.some((v) => Math.abs(v - (known[0] ?? v)) > 1e-6);
-    if (moves) { curves[name] = values; units[name] = store.state?.axes[name]?.unit === "deg" ? "°" : "mm"; }
+    const known = values.filter((v) => v !== null),
+      moves = known.some((v) => Math.abs(v - (known[0] ?? v)) > 1e-6);
+    if (moves) {
+      curves[name] = values;
+      units[name] = store.state?.axes[name]?.unit === "deg" ? "°" : "mm";
+    }
   }
-  if (told.clearance_mm) { curves.clearance = told.clearance_mm; units.clearance = "mm"; }
-  if (told.counts) { curves["mean counts"] = told.counts; units["mean counts"] = ""; }
-  plan = { duration_s: times.at(-1) ?? 0, times, curves, units, images: times.map((t, k) => [t, kinds[k]]), axis: told.times_s ? "s" : "" };
+  if (told.clearance_mm) {
+    curves.clearance = told.clearance_mm;
+    units.clearance = "mm";
+  }
+  if (told.counts) {
+    curves["mean counts"] = told.counts;
+    units["mean counts"] = "";
+  }
+  plan = {
+    duration_s: times.at(-1) ?? 0,
+    times,
+    curves,
+    units,
+    images: times.map((t, k) => [t, kinds[k]]),
+    axis: told.times_s ? "s" : "",
+  };
   redraw();
 }
-let moment: number | null = null, kept: number | undefined;
+let moment: number | null = null,
+  kept: number | undefined;
 function redraw() {
   if (!plan || panel.hidden) return;
-  const rest = panel.offsetHeight - $(".lanes", panel).offsetHeight + 2, room = Math.max(LEAST_PX, 0.45 * $("#stage").clientHeight - rest);
+  const rest = panel.offsetHeight - $(".lanes", panel).offsetHeight + 2,
+    room = Math.max(LEAST_PX, 0.45 * $("#stage").clientHeight - rest);
   drawTimeline(canvas, plan, moment, null, room);
   $("#stage").style.setProperty("--record", `${rest + Math.min(canvas.offsetHeight, room)}px`);
 }
@@ -149,58 +368,99 @@ const kindAsked = () => $select("#kind").value as Kind;
 async function show(wanted: number) {
   if (!told) return;
   index = Math.min(Math.max(0, wanted), told.images - 1);
-  slider.value = String(index); next = index;
+  slider.value = String(index);
+  next = index;
   if (asking) return;
   asking = true;
   const name = told.info.name;
   while (next !== null && still(name)) {
-    const at: number = next, kinds: DatasetResult = told.whole ?? told, k = kinds.indices.indexOf(at);
+    const at: number = next,
+      kinds: DatasetResult = told.whole ?? told,
+      k = kinds.indices.indexOf(at);
     next = null;
     // Dark and flat images have no line integrals; of an image between those told the answer says what it is.
     const kind = k >= 0 && kinds.kinds[k] !== "projection" ? "counts" : kindAsked();
-    let about: AboutImage | null = null, why = "";
-    try { about = await call("viewer.recorded_image", { index: at, kind, virtual: compare.how() !== "recorded" }); }
-    catch (error) {
+    let about: AboutImage | null = null,
+      why = "";
+    try {
+      about = await call("viewer.recorded_image", {
+        index: at,
+        kind,
+        virtual: compare.how() !== "recorded",
+      });
+    } catch (error) {
       why = words(error);
-      if (kind !== "counts") about = await call("viewer.recorded_image", { index: at, kind: "counts" }).catch(() => null);
+      if (kind !== "counts")
+        about = await call("viewer.recorded_image", { index: at, kind: "counts" }).catch(
+          () => null,
+        );
     }
     if (!still(name)) break;
-    moment = about ? about.time_s ?? at : told.times_s ? null : at;
+    moment = about ? (about.time_s ?? at) : told.times_s ? null : at;
     store.hidden = !about;
-    if (!about) { store.image = null; emit("image"); }
-    panel.dataset.index = String(at); panel.dataset.shown = String(Boolean(about));
-    const facts = about && [about.file, about.time_s === null ? "" : `${fixed(about.time_s, 2)} s`, about.image === "projection" ? "" : about.image,
-      why && `counts: ${why}`, about.problem && `no virtual image: ${about.problem}`];
-    setText($("#record-at"), [`image ${at + 1} of ${told.images}`, ...(facts ?? [why])].filter(Boolean).join(" · "));
+    if (!about) {
+      store.image = null;
+      emit("image");
+    }
+    panel.dataset.index = String(at);
+    panel.dataset.shown = String(Boolean(about));
+    const facts = about && [
+      about.file,
+      about.time_s === null ? "" : `${fixed(about.time_s, 2)} s`,
+      about.image === "projection" ? "" : about.image,
+      why && `counts: ${why}`,
+      about.problem && `no virtual image: ${about.problem}`,
+    ];
+    setText(
+      $("#record-at"),
+      [`image ${at + 1} of ${told.images}`, ...(facts ?? [why])].filter(Boolean).join(" · "),
+    );
     $("#record-at").title = $("#record-at").textContent;
     redraw();
   }
   asking = false;
-  if (told && next !== null) { void show(next); return; }
+  if (told && next !== null) {
+    void show(next);
+    return;
+  }
   clearTimeout(kept);
-  kept = window.setTimeout(() => { if (told) remember({ frame: index }); }, SEARCH_MS);
+  kept = window.setTimeout(() => {
+    if (told) remember({ frame: index });
+  }, SEARCH_MS);
 }
 async function play(on: boolean) {
   playing = on;
-  setText($button("#record-play"), on ? "❚❚" : "▶"); $button("#record-play").title = on ? "Pause" : "Play";
+  setText($button("#record-play"), on ? "❚❚" : "▶");
+  $button("#record-play").title = on ? "Pause" : "Play";
   if (!on || !told) return;
   if (index >= told.images - 1) index = -1;
   const step = Math.max(1, Math.round(told.images / PLAYED));
   while (playing && told && index < told.images - 1) {
     const begun = performance.now();
     await show(index + step);
-    await new Promise((done) => setTimeout(done, Math.max(0, LEAST_MS - (performance.now() - begun))));
+    await new Promise((done) =>
+      setTimeout(done, Math.max(0, LEAST_MS - (performance.now() - begun))),
+    );
   }
   if (playing) void play(false);
 }
 async function script() {
   if (!told) return;
-  const answer = await command("dataset.get", { name: told.info.name, points: 2, script: true }, "No script");
+  const answer = await command(
+    "dataset.get",
+    { name: told.info.name, points: 2, script: true },
+    "No script",
+  );
   if (answer?.script) emit("script", answer.script);
 }
 // The virtual image goes with what the twin has in force.
 let force = "";
-const anew = () => { if (told) { setText($("#record-note"), note()); void show(index); } };
+const anew = () => {
+  if (told) {
+    setText($("#record-note"), note());
+    void show(index);
+  }
+};
 on("compare", anew);
 on("state", ({ sample, correction }) => {
   const now = JSON.stringify([sample, correction?.name]);
@@ -210,31 +470,59 @@ on("state", ({ sample, correction }) => {
 slid(canvas, (part) => {
   void play(false);
   if (!plan || !told) return;
-  const { times, duration_s } = plan, t = part * duration_s;
-  const k = times.reduce((best, v, i) => (Math.abs(v - t) < Math.abs(times[best] - t) ? i : best), 0);
+  const { times, duration_s } = plan,
+    t = part * duration_s;
+  const k = times.reduce(
+    (best, v, i) => (Math.abs(v - t) < Math.abs(times[best] - t) ? i : best),
+    0,
+  );
   void show(told.indices[k]);
 });
 slider.addEventListener("pointerdown", () => void play(false));
 new ResizeObserver(redraw).observe(panel);
-new MutationObserver(redraw).observe(document.documentElement, { attributeFilter: ["data-theme"] });
-$select("#kind").addEventListener("change", () => { if (told) void show(index); });
+new MutationObserver(redraw).observe(document.documentElement, {
+  attributeFilter: ["data-theme"],
+});
+$select("#kind").addEventListener("change", () => {
+  if (told) void show(index);
+});
 window.addEventListener("keydown", (e) => {
-  if (e.key !== "Escape" || panel.hidden || $dialog("#help-dialog").open || within(e.target, "input[type=text], textarea, select")) return;
+  if (
+    e.key !== "Escape" ||
+    panel.hidden ||
+    $dialog("#help-dialog").open ||
+    within(e.target, "input[type=text], textarea, select")
+  )
+    return;
   void open(null, null, true);
 });
 // A viewer that was started again knows nothing of it; a page that was loaded again asks for what its address
 // names: once the viewer has seen the twin, and this page has its own connection to it.
-let lost = false, first = true, seen = false;
+let lost = false,
+  first = true,
+  seen = false;
 function ready() {
   if (!seen || !store.session) return;
-  if (first) { first = false; restore(); }
-  else if (lost && told) { lost = false; void open(told.info.name, index); }
+  if (first) {
+    first = false;
+    restore();
+  } else if (lost && told) {
+    lost = false;
+    void open(told.info.name, index);
+  }
 }
-on("open", () => { seen = false; lost = told !== null; });
-on("layers", () => { seen = true; ready(); });
+on("open", () => {
+  seen = false;
+  lost = told !== null;
+});
+on("layers", () => {
+  seen = true;
+  ready();
+});
 on("session", ready);
 export function restore(): void {
-  const name = asked("data"), at = asked("frame") === null ? null : Number(asked("frame")) || 0;
+  const name = asked("data"),
+    at = asked("frame") === null ? null : Number(asked("frame")) || 0;
   if (name !== (told?.info.name ?? null)) void open(name, at);
   else if (told && at !== null) void show(at);
 }

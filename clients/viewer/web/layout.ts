@@ -2,31 +2,66 @@
 import { $, $button, $dialog, keep } from "./dom.js";
 import { on } from "./link.js";
 
-const KEY = "flexdt-right", LEAST = 280, STEP = 32;
-const page = $("main"), splitter = $("#splitter");
+const KEY = "flexdt-right",
+  LEAST = 280,
+  STEP = 32;
+const page = $("main"),
+  splitter = $("#splitter");
 let wide: number | null = null;
 function set(width: number) {
   const most = Math.max(LEAST, page.clientWidth - $("#left").offsetWidth - 160);
   wide = Math.round(Math.min(most, Math.max(LEAST, width)));
   page.style.setProperty("--right", `${wide}px`);
   splitter.setAttribute("aria-valuenow", String(wide));
-  splitter.setAttribute("aria-valuemin", String(LEAST)); splitter.setAttribute("aria-valuemax", String(Math.round(most)));
+  splitter.setAttribute("aria-valuemin", String(LEAST));
+  splitter.setAttribute("aria-valuemax", String(Math.round(most)));
 }
-splitter.addEventListener("pointerdown", (e) => { e.preventDefault(); splitter.setPointerCapture(e.pointerId); });
-splitter.addEventListener("pointermove", (e) => { if (splitter.hasPointerCapture(e.pointerId)) set(page.getBoundingClientRect().right - e.clientX); });
+splitter.addEventListener("pointerdown", (e) => {
+  e.preventDefault();
+  splitter.setPointerCapture(e.pointerId);
+});
+splitter.addEventListener("pointermove", (e) => {
+  if (splitter.hasPointerCapture(e.pointerId))
+    set(page.getBoundingClientRect().right - e.clientX);
+});
 splitter.addEventListener("pointerup", () => keep(KEY, String(wide)));
-splitter.addEventListener("dblclick", () => { page.style.removeProperty("--right"); localStorage.removeItem(KEY); });
+splitter.addEventListener("dblclick", () => {
+  page.style.removeProperty("--right");
+  localStorage.removeItem(KEY);
+});
 splitter.addEventListener("keydown", (e) => {
   const step = e.key === "ArrowLeft" ? STEP : e.key === "ArrowRight" ? -STEP : 0;
-  if (step) { e.preventDefault(); e.stopPropagation(); set($("#right").offsetWidth + step); keep(KEY, String(wide)); }
+  if (step) {
+    e.preventDefault();
+    e.stopPropagation();
+    set($("#right").offsetWidth + step);
+    keep(KEY, String(wide));
+  }
 });
 const kept = Number(localStorage.getItem(KEY));
-if (kept > 0) set(kept); else splitter.setAttribute("aria-valuenow", String($("#right").offsetWidth));
+if (kept > 0) set(kept);
+else splitter.setAttribute("aria-valuenow", String($("#right").offsetWidth));
 
 export function large(on: boolean): void {
   document.body.classList.toggle("large", on);
   $button("#film-large").setAttribute("aria-pressed", String(on));
 }
-$button("#film-large").addEventListener("click", () => large(!document.body.classList.contains("large")));
-on("tab", () => large(false)); on("recorded", () => large(false));
-window.addEventListener("keydown", (e) => { if (e.key === "Escape" && document.body.classList.contains("large") && !$dialog("#help-dialog").open) { e.stopImmediatePropagation(); large(false); } }, true);
+$button("#film-large").addEventListener("click", () =>
+  large(!document.body.classList.contains("large")),
+);
+on("tab", () => large(false));
+on("recorded", () => large(false));
+window.addEventListener(
+  "keydown",
+  (e) => {
+    if (
+      e.key === "Escape" &&
+      document.body.classList.contains("large") &&
+      !$dialog("#help-dialog").open
+    ) {
+      e.stopImmediatePropagation();
+      large(false);
+    }
+  },
+  true,
+);

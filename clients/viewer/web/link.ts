@@ -1,36 +1,99 @@
 // The page's connection to its viewer: requests with answers, newest states and images, how old they are,
 // reconnection.
 import { keep, words } from "./dom.js";
-import type { Answers, Camera, Events, Framing, HelloResult, ImageHead, JobStatus, Messages, Near, Pair, Requests, Shown, State } from "./viewer.js";
+import type {
+  Answers,
+  Camera,
+  Events,
+  Framing,
+  HelloResult,
+  ImageHead,
+  JobStatus,
+  Messages,
+  Near,
+  Pair,
+  Requests,
+  Shown,
+  State,
+} from "./viewer.js";
 
-declare global { interface Window { pageId: string } }
-export const pageId = window.pageId = [...crypto.getRandomValues(new Uint8Array(12))].map((b) => b.toString(16).padStart(2, "0")).join("");
+declare global {
+  interface Window {
+    pageId: string;
+  }
+}
+export const pageId = (window.pageId = [...crypto.getRandomValues(new Uint8Array(12))]
+  .map((b) => b.toString(16).padStart(2, "0"))
+  .join(""));
 export const store = {
-  state: null as State | null, framing: null as Framing | null, near: null as Near | null, hello: null as HelloResult | null, session: null as string | null,
-  twin: false, viewer: false, layers: {} as Record<string, boolean>, opacity: 1, image: null as Shown | null, recorded: null as string | null, hidden: false,
-  received: { state: 0, image: 0 }, age: 0, fresh: null as number | null, imageAge: 0, job: null as JobStatus | null, refused: null as string | null,
-  problem: null as string | null, coneVec: null as number[] | null, cameras: null as Record<string, Camera> | null,
+  state: null as State | null,
+  framing: null as Framing | null,
+  near: null as Near | null,
+  hello: null as HelloResult | null,
+  session: null as string | null,
+  twin: false,
+  viewer: false,
+  layers: {} as Record<string, boolean>,
+  opacity: 1,
+  image: null as Shown | null,
+  recorded: null as string | null,
+  hidden: false,
+  received: { state: 0, image: 0 },
+  age: 0,
+  fresh: null as number | null,
+  imageAge: 0,
+  job: null as JobStatus | null,
+  refused: null as string | null,
+  problem: null as string | null,
+  coneVec: null as number[] | null,
+  cameras: null as Record<string, Camera> | null,
 };
 // Older than OLD_S, what is shown is said to be old; after SILENT_S nobody waits for answers any more.
 export const OLD_S = 1;
-const SILENT_S = Number(new URLSearchParams(location.search).get("patience") ?? 5), LOOK_MS = 200, STOOD_MS = 1000, REST_MS = 500, TRY_AGAIN = 1013;
+const SILENT_S = Number(new URLSearchParams(location.search).get("patience") ?? 5),
+  LOOK_MS = 200,
+  STOOD_MS = 1000,
+  REST_MS = 500,
+  TRY_AGAIN = 1013;
 type Listeners = { [E in keyof Events]?: Array<(...args: Events[E]) => unknown> };
 const listeners: Listeners = {};
-interface Waiting { resolve: (result: never) => void; reject: (why: Failure) => void; since: number }
+interface Waiting {
+  resolve: (result: never) => void;
+  reject: (why: Failure) => void;
+  since: number;
+}
 const waiting = new Map<number, Waiting>();
 // Why a request was refused; code 0: nobody answered it.
 export class Failure extends Error {
-  constructor(readonly code: number, message: string, readonly data?: unknown) { super(message); }
+  constructor(
+    readonly code: number,
+    message: string,
+    readonly data?: unknown,
+  ) {
+    super(message);
+  }
 }
-let socket: WebSocket | null = null, nextId = 1, pause = 200;
+let socket: WebSocket | null = null,
+  nextId = 1,
+  pause = 200;
 
-export function on<E extends keyof Events>(what: E, f: (...args: Events[E]) => unknown): void { (listeners[what] ??= [] as NonNullable<Listeners[E]>).push(f); }
-export function emit<E extends keyof Events>(what: E, ...args: Events[E]): void { for (const f of listeners[what] ?? []) f(...args); }
+export function on<E extends keyof Events>(what: E, f: (...args: Events[E]) => unknown): void {
+  (listeners[what] ??= [] as NonNullable<Listeners[E]>).push(f);
+}
+export function emit<E extends keyof Events>(what: E, ...args: Events[E]): void {
+  for (const f of listeners[what] ?? []) f(...args);
+}
 
 export type Method = keyof Requests & keyof Answers;
-export function call<M extends Method>(method: M, params: Partial<Requests[M]> = {}): Promise<Answers[M]> {
+export function call<M extends Method>(
+  method: M,
+  params: Partial<Requests[M]> = {},
+): Promise<Answers[M]> {
   return new Promise((resolve, reject) => {
-    if (!socket || socket.readyState !== WebSocket.OPEN) { reject(new Failure(0, "no connection to the viewer")); return; }
+    if (!socket || socket.readyState !== WebSocket.OPEN) {
+      reject(new Failure(0, "no connection to the viewer"));
+      return;
+    }
     const id = nextId++;
     waiting.set(id, { resolve, reject, since: performance.now() });
     socket.send(JSON.stringify({ id, method, params }));
@@ -38,19 +101,38 @@ export function call<M extends Method>(method: M, params: Partial<Requests[M]> =
 }
 
 // A command of a person: what goes wrong becomes a note, whose title may depend on the error.
-export async function command<M extends Method>(method: M, params: Partial<Requests[M]> = {}, title: string | ((error: unknown) => string) = "Refused"): Promise<Answers[M] | null> {
-  try { return await call(method, params); }
-  catch (error) { emit("note", "error", typeof title === "function" ? title(error) : title, words(error)); return null; }
+export async function command<M extends Method>(
+  method: M,
+  params: Partial<Requests[M]> = {},
+  title: string | ((error: unknown) => string) = "Refused",
+): Promise<Answers[M] | null> {
+  try {
+    return await call(method, params);
+  } catch (error) {
+    emit("note", "error", typeof title === "function" ? title(error) : title, words(error));
+    return null;
+  }
 }
 
 // Who is there: kept in this browser, and told to the twin with each connection.
 const PERSON = "flexdt-person";
 export const person = (): string => localStorage.getItem(PERSON) ?? "";
-export function rename(name: string): void { keep(PERSON, name.trim()); socket?.close(); }
+export function rename(name: string): void {
+  keep(PERSON, name.trim());
+  socket?.close();
+}
 export function connect() {
-  socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws/${pageId}?person=${encodeURIComponent(person())}`);
+  socket = new WebSocket(
+    `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws/${pageId}?person=${encodeURIComponent(person())}`,
+  );
   socket.binaryType = "arraybuffer";
-  socket.onopen = () => { store.viewer = true; parts = []; heard = least = null; emit("connection"); emit("open"); };
+  socket.onopen = () => {
+    store.viewer = true;
+    parts = [];
+    heard = least = null;
+    emit("connection");
+    emit("open");
+  };
   socket.onmessage = (event: MessageEvent<string | ArrayBuffer>) => {
     if (typeof event.data === "string") text(event.data);
     else part(event.data);
@@ -58,40 +140,77 @@ export function connect() {
   socket.onclose = (event) => {
     const was = store.viewer || event.code === TRY_AGAIN;
     store.refused = event.code === TRY_AGAIN ? event.reason : null;
-    store.viewer = false; store.twin = false; store.session = null;
+    store.viewer = false;
+    store.twin = false;
+    store.session = null;
     for (const { reject } of waiting.values()) reject(new Failure(0, "the viewer has gone"));
     waiting.clear();
     if (was) emit("connection");
-    setTimeout(connect, pause); pause = Math.min(2 * pause, 2000);
+    setTimeout(connect, pause);
+    pause = Math.min(2 * pause, 2000);
   };
 }
 
 const handlers: { [T in keyof Messages]: (m: Messages[T]) => void } = {
   answer(m) {
-    const w = waiting.get(m.id); waiting.delete(m.id);
+    const w = waiting.get(m.id);
+    waiting.delete(m.id);
     if (m.error) w?.reject(new Failure(m.error.code, m.error.message, m.error.data));
     else w?.resolve(m.result as never);
   },
   state(m) {
     took("state");
-    Object.assign(store, { state: m.state, framing: m.framing, near: m.near, coneVec: m.cone_vec });
+    Object.assign(store, {
+      state: m.state,
+      framing: m.framing,
+      near: m.near,
+      coneVec: m.cone_vec,
+    });
     store.received.state++;
-    if (!store.twin) { store.twin = true; emit("connection"); }
+    if (!store.twin) {
+      store.twin = true;
+      emit("connection");
+    }
     emit("state", m.state);
   },
   link(m) {
     pause = 200;
-    Object.assign(store, { refused: null, twin: m.connected, problem: m.problem, cameras: m.cameras });
+    Object.assign(store, {
+      refused: null,
+      twin: m.connected,
+      problem: m.problem,
+      cameras: m.cameras,
+    });
     store.hello = m.hello ?? store.hello;
     emit("connection");
   },
-  session(m) { store.session = m.session; emit("connection"); if (m.connected) emit("session"); },
-  volume(m) { took("volume"); emit("volume", m); },
-  layers(m) { store.layers = m.shown; store.opacity = m.opacity; emit("layers"); },
-  job(m) { emit("job", m.data); },
-  note(m) { emit("note", m.level, m.title, m.body); },
-  log(m) { emit("log", m.data); },
-  beat(m) { heard = { at: performance.now(), late: late(m.at), silent: m.silent_s }; if (rested()) look(); },
+  session(m) {
+    store.session = m.session;
+    emit("connection");
+    if (m.connected) emit("session");
+  },
+  volume(m) {
+    took("volume");
+    emit("volume", m);
+  },
+  layers(m) {
+    store.layers = m.shown;
+    store.opacity = m.opacity;
+    emit("layers");
+  },
+  job(m) {
+    emit("job", m.data);
+  },
+  note(m) {
+    emit("note", m.level, m.title, m.body);
+  },
+  log(m) {
+    emit("log", m.data);
+  },
+  beat(m) {
+    heard = { at: performance.now(), late: late(m.at), silent: m.silent_s };
+    if (rested()) look();
+  },
 };
 function text(content: string) {
   const m = JSON.parse(content) as { type: keyof Messages };
@@ -102,39 +221,55 @@ function text(content: string) {
 // has told the viewer nothing. Of the two clocks' difference the least one seen stands for no delay; it may
 // grow by the error of clocks.
 const DRIFT = 1e-4;
-let heard: { at: number; late: number; silent: number } | null = null, least: { lag: number; at: number } | null = null;
+let heard: { at: number; late: number; silent: number } | null = null,
+  least: { lag: number; at: number } | null = null;
 function late(sent: number) {
   const now = performance.now() / 1000;
-  least = least === null ? { lag: now - sent, at: now } : { lag: Math.min(now - sent, least.lag + DRIFT * (now - least.at)), at: now };
+  least =
+    least === null
+      ? { lag: now - sent, at: now }
+      : { lag: Math.min(now - sent, least.lag + DRIFT * (now - least.at)), at: now };
   return now - sent - least.lag;
 }
 let differs: number | null = null;
 function look() {
   const now = performance.now();
   store.age = heard === null ? 0 : (now - heard.at) / 1000 + heard.late + heard.silent;
-  store.fresh = store.age > OLD_S ? null : store.fresh ?? now;
+  store.fresh = store.age > OLD_S ? null : (store.fresh ?? now);
   // An image of another pose than the state's is old, once none has come for a while.
-  const i = store.image, c = store.coneVec;
-  const apart = i && !i.recorded && c && i.cone_vec.some((v, k) => Math.abs(v - c[k]) > 1e-3) ? i : null;
-  differs = apart ? differs ?? now : null;
-  store.imageAge = apart && differs !== null ? (now - Math.max(differs, apart.at_ms)) / 1000 : 0;
+  const i = store.image,
+    c = store.coneVec;
+  const apart =
+    i && !i.recorded && c && i.cone_vec.some((v, k) => Math.abs(v - c[k]) > 1e-3) ? i : null;
+  differs = apart ? (differs ?? now) : null;
+  store.imageAge =
+    apart && differs !== null ? (now - Math.max(differs, apart.at_ms)) / 1000 : 0;
   emit("age");
 }
 // A page that itself stood still (much to draw, a laptop asleep) first reads what has come meanwhile, before it
 // says that the viewer is silent.
-let looked = performance.now(), woken = -Infinity;
-const rested = () => performance.now() - looked < STOOD_MS && performance.now() - woken > REST_MS;
+let looked = performance.now(),
+  woken = -Infinity;
+const rested = () =>
+  performance.now() - looked < STOOD_MS && performance.now() - woken > REST_MS;
 setInterval(() => {
-  const now = performance.now(), awake = now - looked < STOOD_MS;
+  const now = performance.now(),
+    awake = now - looked < STOOD_MS;
   if (!awake) woken = now;
   looked = now;
   if (rested()) look();
   if (!awake || store.age <= SILENT_S) return;
-  for (const [id, w] of waiting) if (now - w.since > 1000 * SILENT_S) { waiting.delete(id); w.reject(new Failure(0, `no answer for ${SILENT_S} s; it may still take effect`)); }
+  for (const [id, w] of waiting)
+    if (now - w.since > 1000 * SILENT_S) {
+      waiting.delete(id);
+      w.reject(new Failure(0, `no answer for ${SILENT_S} s; it may still take effect`));
+    }
 }, LOOK_MS);
 
 // What is acknowledged makes room for the next: so nothing old waits in sockets.
-function took(slot: string) { if (socket?.readyState === WebSocket.OPEN) socket.send(`{"took":"${slot}"}`); }
+function took(slot: string) {
+  if (socket?.readyState === WebSocket.OPEN) socket.send(`{"took":"${slot}"}`);
+}
 let parts: Uint8Array[] = [];
 function part(buffer: ArrayBuffer) {
   took("image");
@@ -142,7 +277,10 @@ function part(buffer: ArrayBuffer) {
   parts.push(bytes.subarray(1));
   if (bytes[0] === 0) return;
   const whole = new Uint8Array(parts.reduce((n, p) => n + p.length, 0));
-  parts.reduce((n, p) => { whole.set(p, n); return n + p.length; }, 0);
+  parts.reduce((n, p) => {
+    whole.set(p, n);
+    return n + p.length;
+  }, 0);
   parts = [];
   void image(whole);
 }
@@ -151,16 +289,22 @@ type Body = Uint8Array<ArrayBuffer>;
 const decoders: Record<ImageHead["code"], (body: Body, shape: Pair) => Promise<Uint16Array>> = {
   async jpeg(body, [rows, cols]) {
     const picture = await createImageBitmap(new Blob([body], { type: "image/jpeg" }));
-    const canvas = new OffscreenCanvas(cols, rows), context = canvas.getContext("2d", { willReadFrequently: true });
+    const canvas = new OffscreenCanvas(cols, rows),
+      context = canvas.getContext("2d", { willReadFrequently: true });
     if (!context) throw new Error("this browser draws nothing");
     context.drawImage(picture, 0, 0);
-    const { data } = context.getImageData(0, 0, cols, rows), pixels = new Uint16Array(rows * cols);
+    const { data } = context.getImageData(0, 0, cols, rows),
+      pixels = new Uint16Array(rows * cols);
     for (let k = 0; k < pixels.length; k++) pixels[k] = 257 * data[4 * k];
     return pixels;
   },
   // Differences from column to column, low bytes before high ones.
   async deflate(body, [, cols]) {
-    const planes = new Uint8Array(await new Response(new Blob([body]).stream().pipeThrough(new DecompressionStream("deflate"))).arrayBuffer());
+    const planes = new Uint8Array(
+      await new Response(
+        new Blob([body]).stream().pipeThrough(new DecompressionStream("deflate")),
+      ).arrayBuffer(),
+    );
     const pixels = new Uint16Array(planes.length / 2);
     for (let k = 0; k < pixels.length; k++) {
       const step = planes[k] | (planes[pixels.length + k] << 8);
@@ -169,16 +313,23 @@ const decoders: Record<ImageHead["code"], (body: Body, shape: Pair) => Promise<U
     return pixels;
   },
 };
-let unpacked = 0, arrived = 0;
+let unpacked = 0,
+  arrived = 0;
 async function image(whole: Body) {
-  const number = ++arrived, size = new DataView(whole.buffer).getUint32(4, true);
-  const head = JSON.parse(new TextDecoder().decode(whole.subarray(8, 8 + size))) as ImageHead, at_ms = performance.now();
-  const all = await decoders[head.code](whole.subarray(8 + size), head.shape), n = all.length / 2;
-  const got: Shown = head.pair ? { ...head, at_ms, pixels: all.subarray(0, n), virtual: all.subarray(n) } : { ...head, at_ms, pixels: all };
+  const number = ++arrived,
+    size = new DataView(whole.buffer).getUint32(4, true);
+  const head = JSON.parse(new TextDecoder().decode(whole.subarray(8, 8 + size))) as ImageHead,
+    at_ms = performance.now();
+  const all = await decoders[head.code](whole.subarray(8 + size), head.shape),
+    n = all.length / 2;
+  const got: Shown = head.pair
+    ? { ...head, at_ms, pixels: all.subarray(0, n), virtual: all.subarray(n) }
+    : { ...head, at_ms, pixels: all };
   if (number < unpacked) return; // a newer one was quicker
   unpacked = number;
   // Neither a live image while a data set is open, nor the other way round.
   if ((head.recorded?.name ?? null) !== store.recorded || store.hidden) return;
-  store.image = got; store.received.image++;
+  store.image = got;
+  store.received.image++;
   emit("image", got);
 }

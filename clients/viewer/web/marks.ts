@@ -5,36 +5,113 @@ import type { Mark, Pair } from "./viewer.js";
 import { emit, on, store } from "./link.js";
 
 const COLOUR = "#ff3ca0";
-let marks: Mark[] = [], last: Mark | null = null, held = false, of: string | null = null;
+let marks: Mark[] = [],
+  last: Mark | null = null,
+  held = false,
+  of: string | null = null;
 const projection = () => store.image?.recorded?.projection ?? null;
 const here = () => marks.filter((m) => m.frame === projection());
 
 const tools = el("span", { class: "row", style: "flex-wrap:wrap", hidden: true });
-const toggle = el("button", { id: "mark", class: "small", "aria-pressed": "false", title: "Click beads in the images, to calibrate from them; in the radiograph Enter marks its middle, arrows move the last mark by 0.1 px, with Shift by 5", onclick: () => { choose(Boolean(tools.hidden)); } }, "Mark beads");
-const said = el("span", { class: "muted small-text", "aria-live": "polite" }), list = el("span", { id: "marks", class: "row", style: "flex-wrap:wrap" });
-function choose(wanted: boolean) { tools.hidden = !wanted; toggle.setAttribute("aria-pressed", String(wanted)); again(); }
-function again() { tell(); emit("image", store.image); }
+const toggle = el(
+  "button",
+  {
+    id: "mark",
+    class: "small",
+    "aria-pressed": "false",
+    title:
+      "Click beads in the images, to calibrate from them; in the radiograph Enter marks its middle, arrows move the last mark by 0.1 px, with Shift by 5",
+    onclick: () => {
+      choose(Boolean(tools.hidden));
+    },
+  },
+  "Mark beads",
+);
+const said = el("span", { class: "muted small-text", "aria-live": "polite" }),
+  list = el("span", { id: "marks", class: "row", style: "flex-wrap:wrap" });
+function choose(wanted: boolean) {
+  tools.hidden = !wanted;
+  toggle.setAttribute("aria-pressed", String(wanted));
+  again();
+}
+function again() {
+  tell();
+  emit("image", store.image);
+}
 
 // The row of the panel; what is marked is handed on by `calibrate`.
 export function row(calibrate: (marks: Mark[]) => void): HTMLElement {
-  tools.append(el("label", { class: "inline muted" }, "bead ", el("input", { type: "number", id: "mark-bead", min: 0, value: 0, style: "width:58px" })), list, said,
-    el("button", { id: "mark-fit", class: "small", onclick: () => { calibrate(marks); } }, "Calibrate from these"));
+  tools.append(
+    el(
+      "label",
+      { class: "inline muted" },
+      "bead ",
+      el("input", { type: "number", id: "mark-bead", min: 0, value: 0, style: "width:58px" }),
+    ),
+    list,
+    said,
+    el(
+      "button",
+      {
+        id: "mark-fit",
+        class: "small",
+        onclick: () => {
+          calibrate(marks);
+        },
+      },
+      "Calibrate from these",
+    ),
+  );
   return el("div", { class: "row head", id: "mark-row" }, toggle, tools);
 }
 const several = (n: number, what: string) => `${n} ${what}${n === 1 ? "" : "s"}`;
-function remove(mark: Mark) { marks = marks.filter((m) => m !== mark); again(); }
+function remove(mark: Mark) {
+  marks = marks.filter((m) => m !== mark);
+  again();
+}
 function tell() {
   const frame = projection();
-  list.replaceChildren(...here().map((m) => el("button", { class: "small", title: `Remove the mark of bead ${m.marker}`, onclick: () => { remove(m); } }, `${m.marker} ×`)));
-  const at = last && here().includes(last) ? ` · ${last.marker} at ${fixed(last.column, 1)}, ${fixed(last.row, 1)}` : "";
-  setText(said, frame === null ? "no projection is shown" : `${several(marks.length, "mark")} in ${several(new Set(marks.map((m) => m.frame)).size, "image")}${at}`);
+  list.replaceChildren(
+    ...here().map((m) =>
+      el(
+        "button",
+        {
+          class: "small",
+          title: `Remove the mark of bead ${m.marker}`,
+          onclick: () => {
+            remove(m);
+          },
+        },
+        `${m.marker} ×`,
+      ),
+    ),
+  );
+  const at =
+    last && here().includes(last)
+      ? ` · ${last.marker} at ${fixed(last.column, 1)}, ${fixed(last.row, 1)}`
+      : "";
+  setText(
+    said,
+    frame === null
+      ? "no projection is shown"
+      : `${several(marks.length, "mark")} in ${several(new Set(marks.map((m) => m.frame)).size, "image")}${at}`,
+  );
 }
-on("recorded", (name) => { if (name !== of) { of = name; marks = []; choose(false); } });
+on("recorded", (name) => {
+  if (name !== of) {
+    of = name;
+    marks = [];
+    choose(false);
+  }
+});
 on("image", tell);
 
 // Places are in the picture's coordinates: the middle of its first pixel is (0.5, 0.5) there.
 export function click([column, line]: Pair): void {
-  const frame = projection(), bead = $input("#mark-bead"), number = Math.max(0, Math.round(bead.valueAsNumber || 0)), marker = String(number);
+  const frame = projection(),
+    bead = $input("#mark-bead"),
+    number = Math.max(0, Math.round(bead.valueAsNumber || 0)),
+    marker = String(number);
   if (tools.hidden || frame === null) return;
   last = { frame, marker, column: column - 0.5, row: line - 0.5 };
   marks = [...marks.filter((m) => m.frame !== frame || m.marker !== marker), last];
@@ -43,31 +120,53 @@ export function click([column, line]: Pair): void {
 }
 // Whether a press is on a mark, which a drag then moves; a click there is a bead that lies over it.
 export function press([column, line]: Pair, reach: number): boolean {
-  const near = tools.hidden ? undefined : here().find((m) => Math.hypot(m.column + 0.5 - column, m.row + 0.5 - line) < reach);
+  const near = tools.hidden
+    ? undefined
+    : here().find((m) => Math.hypot(m.column + 0.5 - column, m.row + 0.5 - line) < reach);
   held = near !== undefined;
-  if (near) { last = near; start = [column, line]; slack = reach / 2; }
+  if (near) {
+    last = near;
+    start = [column, line];
+    slack = reach / 2;
+  }
   return held;
 }
-let start: Pair = [0, 0], slack = 0;
+let start: Pair = [0, 0],
+  slack = 0;
 export function drag([column, line]: Pair): boolean {
-  if (held && last && Math.hypot(column - start[0], line - start[1]) >= slack) { slack = 0; last.column = column - 0.5; last.row = line - 0.5; again(); }
+  if (held && last && Math.hypot(column - start[0], line - start[1]) >= slack) {
+    slack = 0;
+    last.column = column - 0.5;
+    last.row = line - 0.5;
+    again();
+  }
   return held;
 }
-export function release(): void { held = false; }
+export function release(): void {
+  held = false;
+}
 // The arrows: whether there is a mark that they move.
 export function shift([x, y]: Pair, far: boolean): boolean {
   if (tools.hidden || !last || !here().includes(last)) return false;
-  last.column += x * (far ? 5 : 0.1); last.row += y * (far ? 5 : 0.1);
+  last.column += x * (far ? 5 : 0.1);
+  last.row += y * (far ? 5 : 0.1);
   again();
   return true;
 }
 export function draw(x: CanvasRenderingContext2D, unit: number): void {
   if (tools.hidden) return;
   const arm = 6 * unit;
-  x.strokeStyle = x.fillStyle = COLOUR; x.lineWidth = 1.5 * unit; x.font = `${13 * unit}px sans-serif`; x.beginPath();
+  x.strokeStyle = x.fillStyle = COLOUR;
+  x.lineWidth = 1.5 * unit;
+  x.font = `${13 * unit}px sans-serif`;
+  x.beginPath();
   for (const m of here()) {
-    const c = m.column + 0.5, r = m.row + 0.5;
-    x.moveTo(c - arm, r); x.lineTo(c + arm, r); x.moveTo(c, r - arm); x.lineTo(c, r + arm);
+    const c = m.column + 0.5,
+      r = m.row + 0.5;
+    x.moveTo(c - arm, r);
+    x.lineTo(c + arm, r);
+    x.moveTo(c, r - arm);
+    x.lineTo(c, r + arm);
     x.fillText(m.marker, c + arm, r - arm);
   }
   x.stroke();

@@ -1,6 +1,33 @@
 // The Scan tab: a script to write, check, scrub and run; the job's progress; thumbnails of its frames.
-import { $, $button, $canvas, $input, $select, bytes, chosen, clicks, el, fixed, isNumber, pressed, putGrey, seconds, slid, words } from "./dom.js";
-import type { CheckResult, CheckStep, Compose, JobStatus, Pair, PlanDocument, Problem, ScriptInput, State } from "./viewer.js";
+import {
+  $,
+  $button,
+  $canvas,
+  $input,
+  $select,
+  bytes,
+  chosen,
+  clicks,
+  el,
+  fixed,
+  isNumber,
+  pressed,
+  putGrey,
+  seconds,
+  slid,
+  words,
+} from "./dom.js";
+import type {
+  CheckResult,
+  CheckStep,
+  Compose,
+  JobStatus,
+  Pair,
+  PlanDocument,
+  Problem,
+  ScriptInput,
+  State,
+} from "./viewer.js";
 import { call, command, emit, Failure, on, store } from "./link.js";
 import { rememberedScript, rememberScript } from "./address.js";
 import { folder, open as openData } from "./data.js";
@@ -9,58 +36,115 @@ import * as designer from "./designer.js";
 
 const FINAL = ["done", "failed", "aborted", "incomplete"];
 const MAX_THUMBS = 40;
-const text = $<HTMLTextAreaElement>("#script"), gutter = $("#gutter"), ink = $("#paint div"), LINE_PX = 16;
-let written = [""], worst = new Map<number, "hit" | "soft">(), problems: Problem[] = [], plan: (Lanes & PlanDocument) | null = null, planned = "", lost = false, sent = "";
+const text = $<HTMLTextAreaElement>("#script"),
+  gutter = $("#gutter"),
+  ink = $("#paint div"),
+  LINE_PX = 16;
+let written = [""],
+  worst = new Map<number, "hit" | "soft">(),
+  problems: Problem[] = [],
+  plan: (Lanes & PlanDocument) | null = null,
+  planned = "",
+  lost = false,
+  sent = "";
 
 designer.place($("#tab-scan .card"));
 clicks({
-  "script-open": () => $input("#script-file").click(), "check": checkAndPlan, "plan": showPlan, run,
-  "compose": () => compose(), "unscrub": () => scrub(null), "job-scrub": recall,
+  "script-open": () => $input("#script-file").click(),
+  check: checkAndPlan,
+  plan: showPlan,
+  run,
+  compose: () => compose(),
+  unscrub: () => scrub(null),
+  "job-scrub": recall,
   "job-forget": forgetJob,
-  "job-data": () => { emit("show-tab", "data"); void openData(folder(store.job), null, true); },
+  "job-data": () => {
+    emit("show-tab", "data");
+    void openData(folder(store.job), null, true);
+  },
 });
-for (const action of ["pause", "resume", "step", "abort"] as const) clicks({ [`job-${action}`]: () => command(`job.${action}`, { job: store.job?.job }, `Cannot ${action}`) });
+for (const action of ["pause", "resume", "step", "abort"] as const)
+  clicks({
+    [`job-${action}`]: () =>
+      command(`job.${action}`, { job: store.job?.job }, `Cannot ${action}`),
+  });
 
 function marks() {
-  written = text.value.split("\n"); worst = new Map();
+  written = text.value.split("\n");
+  worst = new Map();
   for (const id of ["#check", "#run", "#plan"]) $button(id).disabled = !text.value.trim();
   $("#empty-note").hidden = text.value.trim() !== "";
   for (const p of problems) {
-    if (p.line) worst.set(p.line, worst.get(p.line) === "hit" || p.severity === "error" ? "hit" : "soft");
+    if (p.line)
+      worst.set(p.line, worst.get(p.line) === "hit" || p.severity === "error" ? "hit" : "soft");
   }
   gutter.textContent = "";
   for (let i = 1; i <= Math.min(written.length, 20000); i++) {
-    gutter.append(worst.has(i) ? el("span", { class: worst.get(i), title: said(i) }, String(i)) : String(i), "\n");
+    gutter.append(
+      worst.has(i) ? el("span", { class: worst.get(i), title: said(i) }, String(i)) : String(i),
+      "\n",
+    );
   }
   paint();
 }
-const said = (line: number) => problems.filter((p) => p.line === line).map((p) => p.message).join("; ");
+const said = (line: number) =>
+  problems
+    .filter((p) => p.line === line)
+    .map((p) => p.message)
+    .join("; ");
 // The lines in sight, under the text itself, which is transparent: component, command, values, comments.
 function paint() {
-  const first = Math.max(0, Math.floor(text.scrollTop / LINE_PX) - 1), count = Math.ceil(text.clientHeight / LINE_PX) + 2;
-  ink.replaceChildren(...written.slice(first, first + count).map((line, i) => el("div", { class: worst.get(first + i + 1) ?? "" }, ...inked(line))));
+  const first = Math.max(0, Math.floor(text.scrollTop / LINE_PX) - 1),
+    count = Math.ceil(text.clientHeight / LINE_PX) + 2;
+  ink.replaceChildren(
+    ...written
+      .slice(first, first + count)
+      .map((line, i) => el("div", { class: worst.get(first + i + 1) ?? "" }, ...inked(line))),
+  );
   ink.style.transform = `translate(${-text.scrollLeft}px, ${first * LINE_PX - text.scrollTop}px)`;
   gutter.scrollTop = text.scrollTop;
 }
 function inked(line: string) {
   if (/^\s*(#|\/\/|;)/.test(line)) return [el("i", {}, line)];
-  return line.slice(0, 2000).split("\t").flatMap((word, k) => [k ? "\t" : "", k === 0 ? el("b", {}, word) : k > 1 && /^[-+]?[\d.]/.test(word) ? el("u", {}, word) : word]);
+  return line
+    .slice(0, 2000)
+    .split("\t")
+    .flatMap((word, k) => [
+      k ? "\t" : "",
+      k === 0
+        ? el("b", {}, word)
+        : k > 1 && /^[-+]?[\d.]/.test(word)
+          ? el("u", {}, word)
+          : word,
+    ]);
 }
 // What is wrong with the line that the caret is in.
 function tellLine() {
-  const line = document.activeElement === text && worst.size ? text.value.slice(0, text.selectionStart).split("\n").length : 0;
+  const line =
+    document.activeElement === text && worst.size
+      ? text.value.slice(0, text.selectionStart).split("\n").length
+      : 0;
   $("#line-note").textContent = worst.has(line) ? `line ${line}: ${said(line)}` : "";
   $("#line-note").className = `small-text ${worst.get(line) === "hit" ? "error" : ""}`;
 }
 document.addEventListener("selectionchange", tellLine);
 new ResizeObserver(paint).observe(text);
 // What was found out belongs to the script as it stood: report, marks and timeline go with an edit.
-function outdated() { problems = []; marks(); $("#report").textContent = ""; forget(); rememberScript(text.value); }
+function outdated() {
+  problems = [];
+  marks();
+  $("#report").textContent = "";
+  forget();
+  rememberScript(text.value);
+}
 const dismiss = () => void call("viewer.plan", { text: null }).catch(() => {});
 function forget() {
   $("#timeline-card").hidden = true;
   if (plan) dismiss();
-  plan = null; at = null; next = null; lost = false;
+  plan = null;
+  at = null;
+  next = null;
+  lost = false;
 }
 text.addEventListener("input", outdated);
 text.addEventListener("scroll", paint);
@@ -74,104 +158,244 @@ text.addEventListener("keydown", (e) => {
   }
   leaving = e.key === "Escape";
 });
-text.addEventListener("blur", () => { leaving = false; });
-chosen($input("#script-file"), async (file) => { setScript(await file.text()); sent = file.name.replace(/\.[^.]*$/, ""); });
+text.addEventListener("blur", () => {
+  leaving = false;
+});
+chosen($input("#script-file"), async (file) => {
+  setScript(await file.text());
+  sent = file.name.replace(/\.[^.]*$/, "");
+});
 
-export function setScript(value: string): void { text.value = value; sent = ""; outdated(); }
+export function setScript(value: string): void {
+  text.value = value;
+  sent = "";
+  outdated();
+}
 export function goTo(line: number | null): void {
   if (!line) return;
-  const lines = text.value.split("\n"), start = lines.slice(0, line - 1).reduce((n, l) => n + l.length + 1, 0);
-  text.focus(); text.setSelectionRange(start, start + (lines[line - 1]?.length ?? 0));
-  text.scrollTop = Math.max(0, (line - 5) * 16); text.scrollLeft = 0;
+  const lines = text.value.split("\n"),
+    start = lines.slice(0, line - 1).reduce((n, l) => n + l.length + 1, 0);
+  text.focus();
+  text.setSelectionRange(start, start + (lines[line - 1]?.length ?? 0));
+  text.scrollTop = Math.max(0, (line - 5) * 16);
+  text.scrollLeft = 0;
 }
 
 async function compose(keep: string[] = []) {
-  const frames = $input("#wish-frames").valueAsNumber, exposure_ms = $input("#wish-exposure").valueAsNumber;
+  const frames = $input("#wish-frames").valueAsNumber,
+    exposure_ms = $input("#wish-exposure").valueAsNumber;
   const none = "No script was composed";
-  if (!Number.isInteger(frames) || frames < 1) { emit("note", "error", none, "frames: a whole number above 0"); return; }
-  if (!(exposure_ms > 0)) { emit("note", "error", none, "ms: a number above 0"); return; }
-  const answer = await command("viewer.compose", { kind: $select("#wish-kind").value as Compose["kind"], ...designer.wish(), frames, exposure_ms, keep }, none);
+  if (!Number.isInteger(frames) || frames < 1) {
+    emit("note", "error", none, "frames: a whole number above 0");
+    return;
+  }
+  if (!(exposure_ms > 0)) {
+    emit("note", "error", none, "ms: a number above 0");
+    return;
+  }
+  const answer = await command(
+    "viewer.compose",
+    {
+      kind: $select("#wish-kind").value as Compose["kind"],
+      ...designer.wish(),
+      frames,
+      exposure_ms,
+      keep,
+    },
+    none,
+  );
   if (!answer) return;
   setScript(answer.text);
-  const mine = made = text.value;
+  const mine = (made = text.value);
   await check();
   if (text.value === mine) offer(answer.moved, keep);
 }
 // The designer rewrites what was written here; a script of somebody's own stays until Write is pressed.
 let made = "";
-on("design", () => { if (!text.value || text.value === made) void compose(); });
+on("design", () => {
+  if (!text.value || text.value === made) void compose();
+});
 // What stands elsewhere than a scan's script would put it may be meant so.
 function offer(moved: Record<string, Pair>, kept: string[]) {
-  const axes = Object.entries(moved), unit = (axis: string) => (store.state?.axes[axis]?.unit === "deg" ? "°" : " mm");
-  if (kept.length) $("#report").prepend(el("div", { id: "kept" }, `kept where it stands: ${kept.join(", ")}`));
+  const axes = Object.entries(moved),
+    unit = (axis: string) => (store.state?.axes[axis]?.unit === "deg" ? "°" : " mm");
+  if (kept.length)
+    $("#report").prepend(el("div", { id: "kept" }, `kept where it stands: ${kept.join(", ")}`));
   if (!axes.length) return;
-  $("#report").prepend(el("div", { id: "moved" },
-    ...axes.map(([axis, [now, then]]) => el("div", {}, `${axis} stands at ${fixed(now, 2)}${unit(axis)}; the script puts it to ${fixed(then, 2)}`)),
-    el("button", { id: "keep", class: "small", onclick: () => compose([...kept, ...Object.keys(moved)]) }, axes.length > 1 ? "Keep them where they stand" : "Keep it where it stands")));
+  $("#report").prepend(
+    el(
+      "div",
+      { id: "moved" },
+      ...axes.map(([axis, [now, then]]) =>
+        el(
+          "div",
+          {},
+          `${axis} stands at ${fixed(now, 2)}${unit(axis)}; the script puts it to ${fixed(then, 2)}`,
+        ),
+      ),
+      el(
+        "button",
+        {
+          id: "keep",
+          class: "small",
+          onclick: () => compose([...kept, ...Object.keys(moved)]),
+        },
+        axes.length > 1 ? "Keep them where they stand" : "Keep it where it stands",
+      ),
+    ),
+  );
 }
 
 type Report = Omit<CheckResult, "collisions">;
 type Told = Partial<Problem> & { message: string };
 async function check() {
-  const report = $("#report"), asked = text.value;
+  const report = $("#report"),
+    asked = text.value;
   report.textContent = "checking…";
   let answer: Report;
-  try { answer = await call("script.check", { text: asked }); }
-  catch (error) {
+  try {
+    answer = await call("script.check", { text: asked });
+  } catch (error) {
     if (text.value !== asked) return false;
-    const data = error instanceof Failure ? (error.data as Told[] | { problems?: Told[] } | null | undefined) : null;
+    const data =
+      error instanceof Failure
+        ? (error.data as Told[] | { problems?: Told[] } | null | undefined)
+        : null;
     const list = Array.isArray(data) ? data : data?.problems;
-    if (!Array.isArray(list)) { report.textContent = ""; emit("note", "error", "Check", words(error)); return false; }
-    const problems = list.map((p) => ({ severity: "error" as const, code: "syntax", line: null, column: null, ...p }));
-    answer = { ok: false, problems, steps: [], frames: 0, bytes: 0, duration_s: NaN, min_clearance_mm: null };
+    if (!Array.isArray(list)) {
+      report.textContent = "";
+      emit("note", "error", "Check", words(error));
+      return false;
+    }
+    const problems = list.map((p) => ({
+      severity: "error" as const,
+      code: "syntax",
+      line: null,
+      column: null,
+      ...p,
+    }));
+    answer = {
+      ok: false,
+      problems,
+      steps: [],
+      frames: 0,
+      bytes: 0,
+      duration_s: NaN,
+      min_clearance_mm: null,
+    };
   }
   if (text.value !== asked) return false;
   show(answer);
   return answer.ok;
 }
 // A script that may run is drawn over time, too.
-async function checkAndPlan() { if (await check()) await makePlan(text.value, null); }
+async function checkAndPlan() {
+  if (await check()) await makePlan(text.value, null);
+}
 
 export function show(r: Report): void {
   // Each of `collisions` is among the problems already, in words.
-  problems = r.problems.map((p) => (p.code === "collision" ? { ...p, message: `collision: ${p.message}` } : p));
+  problems = r.problems.map((p) =>
+    p.code === "collision" ? { ...p, message: `collision: ${p.message}` } : p,
+  );
   marks();
   const box = $("#report");
   box.textContent = "";
-  const clearance = isNumber(r.min_clearance_mm) ? ` · moving parts stay ${fixed(r.min_clearance_mm, 1)} mm apart` : "";
-  box.append(el("div", {},
-    el("span", { class: `verdict ${r.ok ? "ok" : "bad"}` }, r.ok ? "Ready to run" : "Not ready"),
-    el("span", { class: "muted", title: "Of parts that move against each other; those that stand or move together are not counted" }, `  ${seconds(r.duration_s)} · ${r.frames} frames · ${bytes(r.bytes)}${clearance}`)));
-  const link = (line: number | null) => (line ? el("a", pressed(() => goTo(line)), `line ${line}`) : el("span", { class: "muted" }, "whole"));
+  const clearance = isNumber(r.min_clearance_mm)
+    ? ` · moving parts stay ${fixed(r.min_clearance_mm, 1)} mm apart`
+    : "";
+  box.append(
+    el(
+      "div",
+      {},
+      el(
+        "span",
+        { class: `verdict ${r.ok ? "ok" : "bad"}` },
+        r.ok ? "Ready to run" : "Not ready",
+      ),
+      el(
+        "span",
+        {
+          class: "muted",
+          title:
+            "Of parts that move against each other; those that stand or move together are not counted",
+        },
+        `  ${seconds(r.duration_s)} · ${r.frames} frames · ${bytes(r.bytes)}${clearance}`,
+      ),
+    ),
+  );
+  const link = (line: number | null) =>
+    line
+      ? el(
+          "a",
+          pressed(() => goTo(line)),
+          `line ${line}`,
+        )
+      : el("span", { class: "muted" }, "whole");
   for (const p of problems.slice(0, 100)) {
-    box.append(el("div", { class: "problem" }, link(p.line), el("span", { class: p.severity === "error" ? "error" : "" }, p.message)));
+    box.append(
+      el(
+        "div",
+        { class: "problem" },
+        link(p.line),
+        el("span", { class: p.severity === "error" ? "error" : "" }, p.message),
+      ),
+    );
   }
-  if (r.steps.length) box.append(el("div", { class: "steps mono" }, ...r.steps.slice(0, 500).map(stepRow)));
+  if (r.steps.length)
+    box.append(el("div", { class: "steps mono" }, ...r.steps.slice(0, 500).map(stepRow)));
   checked = store.state && stands(store.state);
 }
 // A report holds for what the machine was when it came: any client may change that.
 let checked: string | null = null;
-const stands = (s: State) => JSON.stringify([s.sample, s.correction, Object.entries(s.axes).map(([name, { position }]) => [name, position.toFixed(2)])]);
+const stands = (s: State) =>
+  JSON.stringify([
+    s.sample,
+    s.correction,
+    Object.entries(s.axes).map(([name, { position }]) => [name, position.toFixed(2)]),
+  ]);
 on("state", (s) => {
-  const box = $("#report"), stale = box.querySelector(".verdict") !== null && checked !== stands(s);
+  const box = $("#report"),
+    stale = box.querySelector(".verdict") !== null && checked !== stands(s);
   box.classList.toggle("stale", stale);
   const old = document.getElementById("stale");
-  if (stale && !old) box.prepend(el("div", { id: "stale" }, "The machine has changed since: check again"));
+  if (stale && !old)
+    box.prepend(el("div", { id: "stale" }, "The machine has changed since: check again"));
   else if (!stale) old?.remove();
 });
 function stepRow(s: CheckStep) {
-  const go = () => { goTo(s.line); if (plan) void scrub(s.start_s + s.duration_s); };
-  return el("div", pressed(go),
-    el("a", {}, String(s.line ?? "")), el("span", { class: "muted" }, `${fixed(s.start_s, 1)} s`), el("span", { title: s.what }, s.what));
+  const go = () => {
+    goTo(s.line);
+    if (plan) void scrub(s.start_s + s.duration_s);
+  };
+  return el(
+    "div",
+    pressed(go),
+    el("a", {}, String(s.line ?? "")),
+    el("span", { class: "muted" }, `${fixed(s.start_s, 1)} s`),
+    el("span", { title: s.what }, s.what),
+  );
 }
 
 async function makePlan(script = text.value, time: number | null = 0) {
   if (store.recorded) await openData(null);
   const answer = await command("viewer.plan", { text: script }, "No plan");
-  if (text.value !== script) { if (answer && !plan) dismiss(); return; }
-  if (!answer) { forget(); return; }
-  const units = Object.fromEntries(Object.keys(answer.curves).map((axis) => [axis, store.state?.axes[axis]?.unit === "deg" ? "°" : "mm"]));
-  plan = { ...answer, units }; planned = script;
+  if (text.value !== script) {
+    if (answer && !plan) dismiss();
+    return;
+  }
+  if (!answer) {
+    forget();
+    return;
+  }
+  const units = Object.fromEntries(
+    Object.keys(answer.curves).map((axis) => [
+      axis,
+      store.state?.axes[axis]?.unit === "deg" ? "°" : "mm",
+    ]),
+  );
+  plan = { ...answer, units };
+  planned = script;
   $("#timeline-card").hidden = false;
   void scrub(time);
 }
@@ -181,101 +405,181 @@ async function showPlan() {
   if (plan) $("#timeline-card").scrollIntoView({ block: "nearest" });
 }
 // A plan lives in the viewer: one that was started again makes it anew, once it has seen the twin.
-on("open", () => { lost = plan !== null; });
-on("layers", () => { if (lost) { lost = false; void makePlan(planned, at); } });
+on("open", () => {
+  lost = plan !== null;
+});
+on("layers", () => {
+  if (lost) {
+    lost = false;
+    void makePlan(planned, at);
+  }
+});
 
-on("recorded", (name) => { if (name !== null) forget(); });
+on("recorded", (name) => {
+  if (name !== null) forget();
+});
 // A scan that was run, as it was planned: its script lies with its data set.
 async function recall() {
   const dataset = folder(store.job);
-  const answer = await command("dataset.get", { name: dataset, points: 2, script: true }, "Cannot scrub this scan");
-  if (answer?.script) { bring(answer.script); await showPlan(); }
+  const answer = await command(
+    "dataset.get",
+    { name: dataset, points: 2, script: true },
+    "Cannot scrub this scan",
+  );
+  if (answer?.script) {
+    bring(answer.script);
+    await showPlan();
+  }
 }
-function bring(script: string) { emit("show-tab", "scan"); setScript(script); }
+function bring(script: string) {
+  emit("show-tab", "scan");
+  setScript(script);
+}
 on("script", bring);
 
-let asking = false, next: [number | null] | null = null, at: number | null = null;
+let asking = false,
+  next: [number | null] | null = null,
+  at: number | null = null;
 export async function scrub(time: number | null): Promise<void> {
-  at = time; next = [time];
+  at = time;
+  next = [time];
   redraw();
   if (asking) return;
   asking = true;
-  while (next) { const [t]: [number | null] = next; next = null; await command("viewer.scrub", { time_s: t }, "Cannot show this moment"); }
+  while (next) {
+    const [t]: [number | null] = next;
+    next = null;
+    await command("viewer.scrub", { time_s: t }, "Cannot show this moment");
+  }
   asking = false;
 }
 function redraw() {
   if (!plan) return;
-  drawTimeline($canvas("#timeline"), plan, at, store.job && !FINAL.includes(store.job.state) ? store.job.elapsed_s : null);
-  const now = at, step = now === null ? null : plan.steps.findLast((s) => s.start_s <= now + 1e-9);
-  $("#scrub-at").textContent = at === null ? `${seconds(plan.duration_s)} in all` : `${fixed(at, 1)} s · line ${step?.line ?? "–"} · ${step?.what ?? ""}`;
+  drawTimeline(
+    $canvas("#timeline"),
+    plan,
+    at,
+    store.job && !FINAL.includes(store.job.state) ? store.job.elapsed_s : null,
+  );
+  const now = at,
+    step = now === null ? null : plan.steps.findLast((s) => s.start_s <= now + 1e-9);
+  $("#scrub-at").textContent =
+    at === null
+      ? `${seconds(plan.duration_s)} in all`
+      : `${fixed(at, 1)} s · line ${step?.line ?? "–"} · ${step?.what ?? ""}`;
   $("#scrub-at").title = $("#scrub-at").textContent;
-  const told = { "aria-valuemax": plan.duration_s, "aria-valuenow": at ?? 0, "aria-valuetext": $("#scrub-at").textContent };
+  const told = {
+    "aria-valuemax": plan.duration_s,
+    "aria-valuenow": at ?? 0,
+    "aria-valuetext": $("#scrub-at").textContent,
+  };
   for (const [name, value] of Object.entries(told)) canvas.setAttribute(name, String(value));
 }
 const canvas = $canvas("#timeline");
-slid(canvas, (part) => { if (plan) void scrub(part * plan.duration_s); });
-const STEPS: Record<string, number | undefined> = { ArrowLeft: -0.01, ArrowRight: 0.01, Home: -1, End: 1 };
+slid(canvas, (part) => {
+  if (plan) void scrub(part * plan.duration_s);
+});
+const STEPS: Record<string, number | undefined> = {
+  ArrowLeft: -0.01,
+  ArrowRight: 0.01,
+  Home: -1,
+  End: 1,
+};
 canvas.addEventListener("keydown", (e) => {
   const step = STEPS[e.key];
-  if (step && plan) { e.preventDefault(); e.stopPropagation(); void scrub(Math.min(1, Math.max(0, (at ?? 0) / plan.duration_s + step)) * plan.duration_s); }
+  if (step && plan) {
+    e.preventDefault();
+    e.stopPropagation();
+    void scrub(Math.min(1, Math.max(0, (at ?? 0) / plan.duration_s + step)) * plan.duration_s);
+  }
 });
 new ResizeObserver(redraw).observe(canvas);
 
 async function run() {
   const speed = $select("#speed-up").value;
-  const params: ScriptInput = { text: text.value, speed_up: speed === "max" ? "max" : Number(speed) };
-  if (sent) params.name = `${sent}-${new Date().toISOString().slice(0, 19).replace(/[:T]/g, "-")}`;
+  const params: ScriptInput = {
+    text: text.value,
+    speed_up: speed === "max" ? "max" : Number(speed),
+  };
+  if (sent)
+    params.name = `${sent}-${new Date().toISOString().slice(0, 19).replace(/[:T]/g, "-")}`;
   const answer = await call("script.submit", params).catch((error: unknown) => {
     emit("note", "error", "The script does not run", words(error));
     if (error instanceof Failure && [-32005, -32002].includes(error.code)) void check();
   });
   if (!answer) return;
   emit("note", "good", "Scan", `${answer.job} has begun`);
-  for (const warning of answer.warnings.slice(0, 3)) emit("note", "warning-note", "Scan", warning);
+  for (const warning of answer.warnings.slice(0, 3))
+    emit("note", "warning-note", "Scan", warning);
   if (at !== null) void scrub(null);
 }
 
 // Jobs come in events of their own and inside states, which may be a little older: those change nothing.
 let toldAt = -Infinity;
-on("connection", () => { if (!store.twin) toldAt = -Infinity; }); // a twin that starts again counts from 0
+on("connection", () => {
+  if (!store.twin) toldAt = -Infinity;
+}); // a twin that starts again counts from 0
 function showJob(job: JobStatus) {
-  const last = store.job, fresh = last?.job !== job.job;
+  const last = store.job,
+    fresh = last?.job !== job.job;
   if (fresh && job.state === "queued" && last && !FINAL.includes(last.state)) return; // its turn comes
-  if (!fresh && (job.time < toldAt || (job.time === toldAt && FINAL.includes(last.state)))) return;
+  if (!fresh && (job.time < toldAt || (job.time === toldAt && FINAL.includes(last.state))))
+    return;
   toldAt = job.time;
   store.job = job;
   const over = FINAL.includes(job.state);
   if (fresh) {
     $("#thumbs").textContent = "";
-    lastThumb = -1; lastImage = store.received.image; ended = null;
+    lastThumb = -1;
+    lastImage = store.received.image;
+    ended = null;
   }
-  if (over && !ended) { ended = { time: job.time + LATE_S, at: fresh ? -Infinity : performance.now() }; thumb(); }
+  if (over && !ended) {
+    ended = { time: job.time + LATE_S, at: fresh ? -Infinity : performance.now() };
+    thumb();
+  }
   $("#job-card").hidden = false;
   $("#job-name").textContent = job.name || job.job;
   $("#job-state").textContent = `${job.state}${pace(job.speed_up)}`;
-  const bar = $("#job-bar"), share = job.frames_total ? job.frames_done / job.frames_total : job.state === "done" ? 1 : 0;
+  const bar = $("#job-bar"),
+    share = job.frames_total
+      ? job.frames_done / job.frames_total
+      : job.state === "done"
+        ? 1
+        : 0;
   bar.className = `progress ${over && job.state !== "done" ? "failed" : job.state}`;
   $("i", bar).style.width = `${(100 * share).toFixed(1)}%`;
   $("#job-frames").textContent = `${job.frames_done} / ${job.frames_total} frames`;
   $("#job-left").textContent = over ? seconds(job.elapsed_s) : left(job);
   const line = job.line ? `line ${job.line}: ` : "";
-  $("#job-what").textContent = job.error ? told(job) : over ? job.dataset ?? "" : `${line}${job.what}`;
+  $("#job-what").textContent = job.error
+    ? told(job)
+    : over
+      ? (job.dataset ?? "")
+      : `${line}${job.what}`;
   $button("#job-pause").disabled = job.state !== "running";
   $button("#job-resume").disabled = $button("#job-step").disabled = job.state !== "paused";
   $button("#job-abort").disabled = over;
   for (const id of ["#job-scrub", "#job-data", "#job-forget"]) $button(id).hidden = !over;
   if (fresh || plan) redraw();
 }
-const told = (job: JobStatus) => (typeof job.error?.message === "string" ? job.error.message : "");
-const pace = (speed: JobStatus["speed_up"]) => (speed === "max" ? " · max" : speed !== 1 ? ` · ${speed}×` : "");
+const told = (job: JobStatus) =>
+  typeof job.error?.message === "string" ? job.error.message : "";
+const pace = (speed: JobStatus["speed_up"]) =>
+  speed === "max" ? " · max" : speed !== 1 ? ` · ${speed}×` : "";
 function left(job: JobStatus) {
   const factor = job.real_time_factor || (job.speed_up === "max" ? null : job.speed_up);
-  return isNumber(job.remaining_s) ? `${seconds(factor ? job.remaining_s / factor : job.remaining_s)} left` : "";
+  return isNumber(job.remaining_s)
+    ? `${seconds(factor ? job.remaining_s / factor : job.remaining_s)} left`
+    : "";
 }
 // A stop that somebody commanded is no failure: the warning below the scene says that the scan is paused.
-const meant = (job: JobStatus) => job.state === "paused" && ["stop", "E-stop"].includes((job.error?.data as { asked?: string } | undefined)?.asked ?? "");
+const meant = (job: JobStatus) =>
+  job.state === "paused" &&
+  ["stop", "E-stop"].includes((job.error?.data as { asked?: string } | undefined)?.asked ?? "");
 on("job", (job) => {
-  const before = store.job, news = before?.job === job.job && before.state !== job.state;
+  const before = store.job,
+    news = before?.job === job.job && before.state !== job.state;
   showJob(job);
   if (news && job.error && !meant(job)) emit("note", "error", `Scan ${job.state}`, told(job));
 });
@@ -290,9 +594,14 @@ async function catchUp() {
   const job = store.job?.job;
   if (job === undefined || performance.now() < caughtUp + AGAIN_MS) return;
   caughtUp = performance.now();
-  const status = await call("job.status", { job }).catch((error: unknown) => (error instanceof Failure && error.code === -32602 ? null : undefined));
+  const status = await call("job.status", { job }).catch((error: unknown) =>
+    error instanceof Failure && error.code === -32602 ? null : undefined,
+  );
   if (store.job?.job !== job || status === undefined) return;
-  if (status) { showJob(status); return; }
+  if (status) {
+    showJob(status);
+    return;
+  }
   store.job = null; // a twin that knows nothing of it
   $("#job-card").hidden = true;
 }
@@ -306,24 +615,47 @@ async function forgetJob() {
 
 // The last frame's image may come a little after the scan's end, by our clock, or be of a little after it, by the twin's.
 const LATE_S = 1.5;
-let lastThumb = -1, lastImage = 0, ended: { time: number; at: number } | null = null;
+let lastThumb = -1,
+  lastImage = 0,
+  ended: { time: number; at: number } | null = null;
 on("image", thumb);
 function thumb() {
-  const job = store.job, image = store.image;
-  if (!job || !job.frames_done || !image || image.recorded || store.received.image === lastImage) return;
+  const job = store.job,
+    image = store.image;
+  if (
+    !job ||
+    !job.frames_done ||
+    !image ||
+    image.recorded ||
+    store.received.image === lastImage
+  )
+    return;
   if (ended && image.time > ended.time && performance.now() > ended.at + 1000 * LATE_S) return;
-  const every = Math.max(1, Math.floor(job.frames_total / MAX_THUMBS)), k = Math.floor(job.frames_done / every);
+  const every = Math.max(1, Math.floor(job.frames_total / MAX_THUMBS)),
+    k = Math.floor(job.frames_done / every);
   if (k === lastThumb) return;
-  lastThumb = k; lastImage = store.received.image;
+  lastThumb = k;
+  lastImage = store.received.image;
   $("#thumb-card").hidden = false;
-  const [rows, cols] = image.shape, w = 124, h = Math.max(1, Math.round((w * rows) / cols));
-  const c = el("canvas"), [low, high] = image.window;
+  const [rows, cols] = image.shape,
+    w = 124,
+    h = Math.max(1, Math.round((w * rows) / cols));
+  const c = el("canvas"),
+    [low, high] = image.window;
   putGrey(c, [h, w], (k) => {
-    const r = Math.floor(k / w), v = image.low + image.scale * image.pixels[Math.floor((r * rows) / h) * cols + Math.floor(((k - r * w) * cols) / w)];
+    const r = Math.floor(k / w),
+      v =
+        image.low +
+        image.scale *
+          image.pixels[
+            Math.floor((r * rows) / h) * cols + Math.floor(((k - r * w) * cols) / w)
+          ];
     return Math.min(255, Math.max(0, (255 * (v - low)) / (high - low))) | 0;
   });
   $("#thumbs").append(el("figure", {}, c, el("figcaption", {}, String(job.frames_done))));
   $("#thumbs").scrollLeft = 1e6;
 }
 marks();
-void rememberedScript().then((script) => { if (script && !text.value) setScript(script); });
+void rememberedScript().then((script) => {
+  if (script && !text.value) setScript(script);
+});

@@ -1,35 +1,74 @@
 // The Setup tab: tube, camera, sample on the stage (with upload), layers of the scene.
-import { $, $$, $button, $canvas, $input, $select, base64, cleared, clicks, el, fixed, keep, numeric, parsed, words } from "./dom.js";
-import type { ExposurePrediction, Placement, PredictedSetting, Requests, SampleUpload, State, UploadResult } from "./viewer.js";
+import {
+  $,
+  $$,
+  $button,
+  $canvas,
+  $input,
+  $select,
+  base64,
+  cleared,
+  clicks,
+  el,
+  fixed,
+  keep,
+  numeric,
+  parsed,
+  words,
+} from "./dom.js";
+import type {
+  ExposurePrediction,
+  Placement,
+  PredictedSetting,
+  Requests,
+  SampleUpload,
+  State,
+  UploadResult,
+} from "./viewer.js";
 import { call, command, emit, on, store } from "./link.js";
 
 const CHUNK = 3 << 20;
 const FORMATS: Array<SampleUpload["format"]> = ["stl", "obj", "ply", "glb", "off"];
-const ROI = ["l", "t", "r", "b"], SIX = ["x", "y", "z", "rx", "ry", "rz"] as const;
+const ROI = ["l", "t", "r", "b"],
+  SIX = ["x", "y", "z", "rx", "ry", "rz"] as const;
 // What is set here and not yet applied bears the class "typed"; everything else shows the state.
 for (const input of $$<HTMLInputElement>("#tab-setup .num")) {
-  numeric(input, () => input.closest(".card")?.querySelector<HTMLElement>("[data-apply]")?.click(), () => takeBack(input.id));
+  numeric(
+    input,
+    () => input.closest(".card")?.querySelector<HTMLElement>("[data-apply]")?.click(),
+    () => takeBack(input.id),
+  );
 }
 for (const list of [$select("#mode"), $select("#sample")]) {
   list.addEventListener("change", () => list.classList.add("typed"));
-  list.addEventListener("keydown", (e) => { if (e.key === "Escape") takeBack(list.id); });
+  list.addEventListener("keydown", (e) => {
+    if (e.key === "Escape") takeBack(list.id);
+  });
 }
-for (const box of $$<HTMLInputElement>("[data-layer]")) box.addEventListener("change", () => void showLayer(box.dataset.layer ?? "", box.checked));
+for (const box of $$<HTMLInputElement>("[data-layer]"))
+  box.addEventListener("change", () => void showLayer(box.dataset.layer ?? "", box.checked));
 const opacity = $input("#opacity");
 opacity.addEventListener("change", () => void reveal({ opacity: Number(opacity.value) }));
 clicks({
-  "tube-apply": setTube, "camera-apply": setCamera, "sample-apply": setSample, "sample-delete": deleteSample, predict, "mesh-upload": sendMesh,
-  "beam": () => command("tube.set", { on: !store.state?.tube.on }, "The tube refuses"),
+  "tube-apply": setTube,
+  "camera-apply": setCamera,
+  "sample-apply": setSample,
+  "sample-delete": deleteSample,
+  predict,
+  "mesh-upload": sendMesh,
+  beam: () => command("tube.set", { on: !store.state?.tube.on }, "The tube refuses"),
 });
 
 // A field or a list of these.
 const of = (id: string) => $<HTMLInputElement | HTMLSelectElement>(`#${id}`);
 const typed = (id: string) => $(`#${id}`).classList.contains("typed");
 function put(id: string, value: number | string | null, digits = 0) {
-  const input = of(id), text = typeof value === "number" ? String(Number(value.toFixed(digits))) : value ?? "";
+  const input = of(id),
+    text = typeof value === "number" ? String(Number(value.toFixed(digits))) : (value ?? "");
   input.title = typed(id) ? `not applied yet; the twin has ${text}` : "";
   if (typed(id) || input.value === text) return;
-  if (input instanceof HTMLSelectElement && ![...input.options].some((o) => o.value === text)) input.append(el("option", { value: text }, text));
+  if (input instanceof HTMLSelectElement && ![...input.options].some((o) => o.value === text))
+    input.append(el("option", { value: text }, text));
   input.value = text;
 }
 function takeBack(...ids: string[]) {
@@ -38,9 +77,11 @@ function takeBack(...ids: string[]) {
 }
 // The numbers of some fields; null, and they show the state again, if one is none.
 function numbers(...ids: string[]) {
-  const values = ids.map((id) => parsed(of(id).value)), wrong = ids.filter((_, i) => !Number.isFinite(values[i]));
+  const values = ids.map((id) => parsed(of(id).value)),
+    wrong = ids.filter((_, i) => !Number.isFinite(values[i]));
   for (const id of wrong) {
-    const input = of(id), name = input.labels?.[0]?.textContent ?? input.getAttribute("aria-label") ?? id;
+    const input = of(id),
+      name = input.labels?.[0]?.textContent ?? input.getAttribute("aria-label") ?? id;
     emit("note", "error", "Not applied", `${name}: “${input.value}” is not a number`);
   }
   takeBack(...wrong);
@@ -53,27 +94,54 @@ function untouched(ids: string[]) {
 }
 // Sends what was typed into `fields` (parameter -> field or fields) as one command; after an error
 // the fields show the state again.
-async function apply<M extends "tube.set" | "camera.set">(method: M, fields: Record<string, string | string[]>, title: string) {
-  const params: Record<string, unknown> = {}, ids = Object.values(fields).flat();
+async function apply<M extends "tube.set" | "camera.set">(
+  method: M,
+  fields: Record<string, string | string[]>,
+  title: string,
+) {
+  const params: Record<string, unknown> = {},
+    ids = Object.values(fields).flat();
   for (const [name, its] of Object.entries(fields)) {
     const some = [its].flat();
     if (!some.some(typed)) continue;
-    const list = of(some[0]), values = list instanceof HTMLSelectElement ? [list.value] : numbers(...some);
+    const list = of(some[0]),
+      values = list instanceof HTMLSelectElement ? [list.value] : numbers(...some);
     if (!values) return;
     params[name] = Array.isArray(its) ? values : values[0];
   }
   if (!Object.keys(params).length) return;
-  const same = untouched(ids), taken = await command(method, params as Requests[M], title);
-  if (taken) for (const id of same()) $(`#${id}`).classList.remove("typed"); // the state comes by itself
+  const same = untouched(ids),
+    taken = await command(method, params as Requests[M], title);
+  if (taken)
+    for (const id of same()) $(`#${id}`).classList.remove("typed"); // the state comes by itself
   else takeBack(...same());
 }
-function setTube() { return apply("tube.set", { kV: "kV", power_W: "power" }, "The tube refuses"); }
-function setCamera() { return apply("camera.set", { exposure_ms: "exposure", averages: "averages", mode: "mode", roi: ROI.map((k) => `roi-${k}`) }, "The camera refuses"); }
+function setTube() {
+  return apply("tube.set", { kV: "kV", power_W: "power" }, "The tube refuses");
+}
+function setCamera() {
+  return apply(
+    "camera.set",
+    {
+      exposure_ms: "exposure",
+      averages: "averages",
+      mode: "mode",
+      roi: ROI.map((k) => `roi-${k}`),
+    },
+    "The camera refuses",
+  );
+}
 async function setSample() {
-  const ids = SIX.map((k) => `off-${k}`), values = numbers(...ids);
+  const ids = SIX.map((k) => `off-${k}`),
+    values = numbers(...ids);
   if (!values) return;
   const offset: Placement = Object.fromEntries(SIX.map((k, i) => [k, values[i]]));
-  const same = untouched(["sample", ...ids]), answer = await command("sample.set", { name: $select("#sample").value, offset }, "The sample stays");
+  const same = untouched(["sample", ...ids]),
+    answer = await command(
+      "sample.set",
+      { name: $select("#sample").value, offset },
+      "The sample stays",
+    );
   if (answer) for (const id of same()) $(`#${id}`).classList.remove("typed");
   else takeBack(...same());
   for (const warning of answer?.warnings ?? []) emit("note", "warning-note", "Sample", warning);
@@ -83,7 +151,10 @@ async function setSample() {
 // had to be changed is never one that is taken, so nothing is overwritten by accident.
 export function sampleName(file: string, taken: string[]): string {
   const bare = file.replace(/\.[^.]*$/, "").normalize("NFC");
-  const name = bare.replace(/[\u0000-\u001f\u007f/\\:*?"<>|]+/g, "-").replace(/^[\s.-]+|[\s.-]+$/g, "").slice(0, 100);
+  const name = bare
+    .replace(/[\u0000-\u001f\u007f/\\:*?"<>|]+/g, "-")
+    .replace(/^[\s.-]+|[\s.-]+$/g, "")
+    .slice(0, 100);
   const stem = name || "mesh";
   if (name === bare || (name && !taken.includes(name))) return name;
   let n = 1;
@@ -91,34 +162,70 @@ export function sampleName(file: string, taken: string[]): string {
   return `${stem}-${n}`;
 }
 export async function sendMesh(): Promise<void> {
-  const file = $input("#mesh-file").files?.[0], note = $("#mesh-note");
-  if (!file) { emit("note", "warning-note", "Upload", "choose a file first"); return; }
+  const file = $input("#mesh-file").files?.[0],
+    note = $("#mesh-note");
+  if (!file) {
+    emit("note", "warning-note", "Upload", "choose a file first");
+    return;
+  }
   const format = FORMATS.find((f) => f === formatOf(file));
-  if (!format) { emit("note", "error", "Upload", `${file.name}: allowed are ${FORMATS.join(", ")}`); return; }
-  if (!file.size) { emit("note", "error", "Upload", `${file.name} is empty`); return; }
+  if (!format) {
+    emit("note", "error", "Upload", `${file.name}: allowed are ${FORMATS.join(", ")}`);
+    return;
+  }
+  if (!file.size) {
+    emit("note", "error", "Upload", `${file.name} is empty`);
+    return;
+  }
   const known = await command("sample.list", {}, "No upload");
   if (!known) return;
-  const name = sampleName(file.name, known.samples.map((s) => s.name)), total = file.size;
-  const common = { name, format, total, unit: $select("#mesh-unit").value as SampleUpload["unit"], material: $select("#mesh-material").value || null };
+  const name = sampleName(
+      file.name,
+      known.samples.map((s) => s.name),
+    ),
+    total = file.size;
+  const common = {
+    name,
+    format,
+    total,
+    unit: $select("#mesh-unit").value as SampleUpload["unit"],
+    material: $select("#mesh-material").value || null,
+  };
   let answer: UploadResult | null = null;
   for (let start = 0; start < total; start += CHUNK) {
     note.textContent = `${Math.round((100 * start) / total)} %`;
     const data = base64(await file.slice(start, start + CHUNK).arrayBuffer());
-    answer = await command("sample.upload", { ...common, start, data }, `${file.name} was not taken`);
-    if (answer === null) { note.textContent = ""; return; }
+    answer = await command(
+      "sample.upload",
+      { ...common, start, data },
+      `${file.name} was not taken`,
+    );
+    if (answer === null) {
+      note.textContent = "";
+      return;
+    }
     for (const warning of answer.warnings ?? []) emit("note", "warning-note", name, warning);
   }
   note.textContent = answer?.complete ? "uploaded" : "";
-  if (!answer?.complete) { emit("note", "error", "Upload", `${file.name} did not arrive as a whole`); return; }
+  if (!answer?.complete) {
+    emit("note", "error", "Upload", `${file.name} did not arrive as a whole`);
+    return;
+  }
   await list();
-  if (await command("sample.set", { name }, "The sample stays")) emit("note", "good", "Sample", `${name} is on the stage`);
+  if (await command("sample.set", { name }, "The sample stays"))
+    emit("note", "good", "Sample", `${name} is on the stage`);
 }
 const formatOf = (file: File) => (file.name.split(".").pop() ?? "").toLowerCase();
-$input("#mesh-file").addEventListener("change", () => { const file = $input("#mesh-file").files?.[0]; if (file) $select("#mesh-unit").value = formatOf(file) === "glb" ? "m" : "mm"; });
+$input("#mesh-file").addEventListener("change", () => {
+  const file = $input("#mesh-file").files?.[0];
+  if (file) $select("#mesh-unit").value = formatOf(file) === "glb" ? "m" : "mm";
+});
 
 // Uploads that can be deleted: the twin says why one that is in use stays.
 let uploads: string[] = [];
-const deletable = () => { $button("#sample-delete").hidden = !uploads.includes($select("#sample").value); };
+const deletable = () => {
+  $button("#sample-delete").hidden = !uploads.includes($select("#sample").value);
+};
 $select("#sample").addEventListener("change", deletable);
 async function deleteSample() {
   const name = $select("#sample").value;
@@ -131,10 +238,19 @@ async function deleteSample() {
 export async function list(): Promise<void> {
   const answer = await call("sample.list").catch(() => null);
   if (!answer) return;
-  const select = $select("#sample"), chosen = typed("sample") ? select.value : store.state?.sample.name ?? "empty";
+  const select = $select("#sample"),
+    chosen = typed("sample") ? select.value : (store.state?.sample.name ?? "empty");
   select.textContent = "";
-  for (const s of answer.samples) select.append(el("option", { value: s.name, title: s.description }, s.uploaded ? `${s.name} (uploaded)` : s.name));
-  if (![...select.options].some((o) => o.value === chosen)) select.append(el("option", { value: chosen }, chosen));
+  for (const s of answer.samples)
+    select.append(
+      el(
+        "option",
+        { value: s.name, title: s.description },
+        s.uploaded ? `${s.name} (uploaded)` : s.name,
+      ),
+    );
+  if (![...select.options].some((o) => o.value === chosen))
+    select.append(el("option", { value: chosen }, chosen));
   select.value = chosen;
   uploads = answer.samples.filter((s) => s.uploaded).map((s) => s.name);
   deletable();
@@ -146,7 +262,8 @@ export async function list(): Promise<void> {
 }
 // What the physics that the twin was started with makes of voltage and filters.
 const PHYSICS: Record<string, string> = {
-  ideal: "Voltage does nothing to the line integrals here: one attenuation for each material. It makes counts brighter, as power and exposure do. Start the twin with --physics poly for spectra.",
+  ideal:
+    "Voltage does nothing to the line integrals here: one attenuation for each material. It makes counts brighter, as power and exposure do. Start the twin with --physics poly for spectra.",
   mono: "Photons of one energy, as many as the spectrum below would make visible: voltage changes brightness and noise, not contrast.",
   poly: "Photons of all energies below, through the filters: voltage changes contrast, brightness and noise.",
 };
@@ -154,66 +271,117 @@ async function predict() {
   if (!store.state) return;
   const now = predictable(store.state);
   predicted = null;
-  $button("#predict").disabled = true; $("#predicted").textContent = "a few seconds …";
+  $button("#predict").disabled = true;
+  $("#predicted").textContent = "a few seconds …";
   const p = await command("exposure.predict", {}, "No prediction");
   $button("#predict").disabled = false;
-  const setting = (s: PredictedSetting) => `${fixed(s.kV, 0)} kV${s.filter ? ` ${s.filter}` : ""}: ${s.cnr === null ? "saturated" : fixed(s.cnr, 1)}`;
-  const told = (p: ExposurePrediction) => [`contrast to noise of ${p.detail}: ${setting(p.asked)}`, ...p.best.slice(0, 1).map((s) => `best ${setting(s)}`),
-    `1 % of the pixels see ${fixed(100 * p.transmission.p1, 1)} % or less`];
+  const setting = (s: PredictedSetting) =>
+    `${fixed(s.kV, 0)} kV${s.filter ? ` ${s.filter}` : ""}: ${s.cnr === null ? "saturated" : fixed(s.cnr, 1)}`;
+  const told = (p: ExposurePrediction) => [
+    `contrast to noise of ${p.detail}: ${setting(p.asked)}`,
+    ...p.best.slice(0, 1).map((s) => `best ${setting(s)}`),
+    `1 % of the pixels see ${fixed(100 * p.transmission.p1, 1)} % or less`,
+  ];
   $("#predicted").textContent = p ? told(p).join(" · ") : "";
   if (p) predicted = now;
 }
 // What a prediction was made for; it goes with that.
 let predicted: string | null = null;
 const predictable = ({ sample, tube, camera, geometry: g }: State) =>
-  JSON.stringify([sample, tube.kV, tube.power_W, camera, g.SOD_mm.toFixed(2), g.SDD_mm.toFixed(2)]);
+  JSON.stringify([
+    sample,
+    tube.kV,
+    tube.power_W,
+    camera,
+    g.SOD_mm.toFixed(2),
+    g.SDD_mm.toFixed(2),
+  ]);
 let spectrumOf: number | null = null;
 async function spectrum(kV: number) {
   if (spectrumOf === kV || $("#tab-setup").hidden) return;
   spectrumOf = kV;
   const kind = store.hello?.physics ?? "not told";
   $("#physics").textContent = kind;
-  $("#physics-note").textContent = PHYSICS[kind] ?? "This twin does not say how it makes its images.";
+  $("#physics-note").textContent =
+    PHYSICS[kind] ?? "This twin does not say how it makes its images.";
   const s = await call("viewer.spectrum", { kV }).catch(words);
   if (spectrumOf !== kV) return;
-  const canvas = $canvas("#spectrum"), [x, w, h] = cleared(canvas);
-  if (typeof s === "string") { $("#filters").textContent = "–"; $("#spectrum-note").textContent = s; return; }
-  $("#filters").textContent = s.filters.map((f) => `${fixed(f.thickness_mm, 2)} mm ${f.material.split("@")[0]}`).join(", ") || "none";
+  const canvas = $canvas("#spectrum"),
+    [x, w, h] = cleared(canvas);
+  if (typeof s === "string") {
+    $("#filters").textContent = "–";
+    $("#spectrum-note").textContent = s;
+    return;
+  }
+  $("#filters").textContent =
+    s.filters
+      .map((f) => `${fixed(f.thickness_mm, 2)} mm ${f.material.split("@")[0]}`)
+      .join(", ") || "none";
   const used = kind === "ideal" ? " · not used by this physics" : "";
-  $("#spectrum-note").textContent = `${fixed(kV, 0)} kV, behind the filters · mean ${fixed(s.mean_keV, 1)} keV${used}`;
-  const most = Math.max(...s.photons), last = Math.max(kV, 1);
-  x.fillStyle = getComputedStyle(canvas).getPropertyValue("--accent"); x.beginPath(); x.moveTo(0, h);
+  $("#spectrum-note").textContent =
+    `${fixed(kV, 0)} kV, behind the filters · mean ${fixed(s.mean_keV, 1)} keV${used}`;
+  const most = Math.max(...s.photons),
+    last = Math.max(kV, 1);
+  x.fillStyle = getComputedStyle(canvas).getPropertyValue("--accent");
+  x.beginPath();
+  x.moveTo(0, h);
   s.photons.forEach((n, k) => x.lineTo((w * s.energy_keV[k]) / last, h - ((h - 2) * n) / most));
-  x.lineTo(w, h); x.fill();
+  x.lineTo(w, h);
+  x.fill();
 }
-on("tab", () => { if (store.state) void spectrum(store.state.tube.kV); });
-on("session", () => { spectrumOf = null; });
+on("tab", () => {
+  if (store.state) void spectrum(store.state.tube.kV);
+});
+on("session", () => {
+  spectrumOf = null;
+});
 let listed: string | null | undefined;
 on("session", list);
 on("state", show);
 function show(state: State) {
-  if (predicted !== null && predicted !== predictable(state)) { predicted = null; $("#predicted").textContent = "sample, beam, camera or distances have changed: predict again"; }
+  if (predicted !== null && predicted !== predictable(state)) {
+    predicted = null;
+    $("#predicted").textContent =
+      "sample, beam, camera or distances have changed: predict again";
+  }
   void spectrum(state.tube.kV);
-  put("kV", state.tube.kV, 2); put("power", state.tube.power_W, 2);
-  const xrays = $button("#beam"), { on, ready } = state.tube;
-  xrays.textContent = on ? (ready ? "X-rays are ON" : "X-rays warm up") : "Switch X-rays on"; xrays.classList.toggle("beam-on", on);
+  put("kV", state.tube.kV, 2);
+  put("power", state.tube.power_W, 2);
+  const xrays = $button("#beam"),
+    { on, ready } = state.tube;
+  xrays.textContent = on ? (ready ? "X-rays are ON" : "X-rays warm up") : "Switch X-rays on";
+  xrays.classList.toggle("beam-on", on);
   xrays.title = on ? "Switch X-rays off" : "Switch X-rays on";
   const c = state.camera;
-  put("exposure", c.exposure_ms, 3); put("averages", c.averages); ROI.forEach((k, i) => put(`roi-${k}`, c.roi[i]));
+  put("exposure", c.exposure_ms, 3);
+  put("averages", c.averages);
+  ROI.forEach((k, i) => put(`roi-${k}`, c.roi[i]));
   put("mode", c.mode);
-  $("#camera-shape").textContent = `${c.shape[1]} × ${c.shape[0]} px, ${fixed(c.pixel_mm * 1000, 1)} µm`;
+  $("#camera-shape").textContent =
+    `${c.shape[1]} × ${c.shape[0]} px, ${fixed(c.pixel_mm * 1000, 1)} µm`;
   const s = state.sample;
   for (const k of SIX) put(`off-${k}`, s.offset[k], 4);
   put("sample", s.name);
-  $("#sample-note").textContent = s.size_mm ? s.size_mm.map((v) => fixed(v, 1)).join(" × ") + " mm" : "";
-  if (listed !== s.name) { listed = s.name; void list(); }
+  $("#sample-note").textContent = s.size_mm
+    ? s.size_mm.map((v) => fixed(v, 1)).join(" × ") + " mm"
+    : "";
+  if (listed !== s.name) {
+    listed = s.name;
+    void list();
+  }
 }
 
 // What somebody wants to see is theirs alone, and this browser remembers it.
 const SHOWN = "flexdt-shown";
 type Seen = Requests["viewer.layers"];
-const reveal = async (wanted: Seen) => { if (await command("viewer.layers", wanted)) keep(SHOWN, JSON.stringify({ ...store.layers, opacity: store.opacity })); };
-on("open", () => { const seen = localStorage.getItem(SHOWN); if (seen) call("viewer.layers", JSON.parse(seen) as Seen).catch(() => {}); });
+const reveal = async (wanted: Seen) => {
+  if (await command("viewer.layers", wanted))
+    keep(SHOWN, JSON.stringify({ ...store.layers, opacity: store.opacity }));
+};
+on("open", () => {
+  const seen = localStorage.getItem(SHOWN);
+  if (seen) call("viewer.layers", JSON.parse(seen) as Seen).catch(() => {});
+});
 // A box keeps what was chosen last until the viewer has answered: states that it sent before that are older.
 const choosing = new Map<string, number>();
 async function showLayer(name: string, visible: boolean) {

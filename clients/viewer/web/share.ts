@@ -1,39 +1,80 @@
 // The Share tab: pictures, files that open anywhere, scenes to save and load.
-import { $input, $select, bytes, chosen, clicks, download, downloadBlob, words } from "./dom.js";
+import {
+  $input,
+  $select,
+  bytes,
+  chosen,
+  clicks,
+  download,
+  downloadBlob,
+  words,
+} from "./dom.js";
 import { command, emit } from "./link.js";
 import { picture } from "./film.js";
 import { current } from "./views.js";
 import type { Export, Requests, Scene } from "./viewer.js";
 
-export async function offer<M extends "viewer.screenshot" | "viewer.export">(method: M, params: Requests[M], title: string): Promise<void> {
+export async function offer<M extends "viewer.screenshot" | "viewer.export">(
+  method: M,
+  params: Requests[M],
+  title: string,
+): Promise<void> {
   const a = await command(method, params, title);
   if (!a) return;
   download(a.url, a.name);
   emit("note", "good", a.name, bytes(a.bytes));
 }
 function shot() {
-  if (current === "none") { emit("note", "error", "No picture", "open a view first"); return; }
+  if (current === "none") {
+    emit("note", "error", "No picture", "open a view first");
+    return;
+  }
   const [width, height] = $select("#shot-size").value.split("x").map(Number);
-  void offer("viewer.screenshot", { view: current === "four" ? "iso" : current ?? "iso", width, height }, "No picture");
+  void offer(
+    "viewer.screenshot",
+    { view: current === "four" ? "iso" : (current ?? "iso"), width, height },
+    "No picture",
+  );
 }
 function film() {
   const png = picture();
   if (png) download(png, "flexdt-radiograph.png");
   else emit("note", "error", "No picture", "no radiograph has come yet");
 }
-const exported = (format: Export["format"], replay = false) => () => offer("viewer.export", { format, replay }, replay ? "No replay" : "No export");
+const exported =
+  (format: Export["format"], replay = false) =>
+  () =>
+    offer("viewer.export", { format, replay }, replay ? "No replay" : "No export");
 async function save() {
   const a = await command("scene.save", {}, "Not saved");
   if (!a) return;
   const scene = new Blob([JSON.stringify(a.document, null, 2)], { type: "application/json" });
-  downloadBlob(scene, `flexdt-scene-${new Date().toISOString().slice(0, 19).replace(/[:T]/g, "-")}.json`);
+  downloadBlob(
+    scene,
+    `flexdt-scene-${new Date().toISOString().slice(0, 19).replace(/[:T]/g, "-")}.json`,
+  );
 }
 clicks({
-  "shot": shot, "shot-film": film, "export-html": exported("html"), "export-viser": exported("viser"),
-  "replay-html": exported("html", true), "replay-viser": exported("viser", true),
-  "scene-save": save, "scene-load": () => $input("#scene-file").click(),
+  shot: shot,
+  "shot-film": film,
+  "export-html": exported("html"),
+  "export-viser": exported("viser"),
+  "replay-html": exported("html", true),
+  "replay-viser": exported("viser", true),
+  "scene-save": save,
+  "scene-load": () => $input("#scene-file").click(),
 });
 chosen($input("#scene-file"), async (file) => {
-  try { if (await command("scene.load", { document: JSON.parse(await file.text()) as Scene }, "Not loaded")) emit("note", "good", "Scene", `${file.name} is loaded`); }
-  catch (error) { emit("note", "error", "Scene", `${file.name}: ${words(error)}`); }
+  try {
+    if (
+      await command(
+        "scene.load",
+        { document: JSON.parse(await file.text()) as Scene },
+        "Not loaded",
+      )
+    )
+      emit("note", "good", "Scene", `${file.name} is loaded`);
+  } catch (error) {
+    emit("note", "error", "Scene", `${file.name}: ${words(error)}`);
+  }
 });
