@@ -18,22 +18,23 @@ from typing import Any, Final, Literal
 ComponentType = Literal["tube", "motor", "camera", "other"]
 
 FEEDBACK_S: Final = 0.8
-"""Real seconds between FDB events: the interface asks for one a second at least."""
+"""Time between two FDB events [s of real time]; at least one a second is required."""
 MAX_BYTES: Final = 1 << 20
-"""Longest event that is read, and longest argument 1: a script."""
+"""Longest event that is read, and longest argument 1 (a script) [bytes]."""
 MAX_CHARS: Final[Mapping[str, int]] = {
     "component": 100, "comp_phys": 1000, "command": 1000, "arg1": MAX_BYTES, "arg2": 4096,
     "reply": 1 << 16, "reply type": 20, "comp_type": 100, "UUID": 200,
 }  # fmt: skip
 """Longest text of each field; the names of most are given by the scanner and far shorter."""
 MAX_UUID: Final = 1e200
-FREE: Final = ("arg1", "arg2", "reply")
-"""Texts that may hold control characters: an argument of the scanner's is binary."""
+"""Greatest absolute value of a numeric UUID."""
+BINARY_FIELDS: Final = ("arg1", "arg2", "reply")
+"""Fields that may hold control characters: arguments may be binary."""
 _SURROGATE = re.compile(r"[\ud800-\udfff]")
 _UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 FIELDS: Final = ("component", "comp_phys", "command", "arg1", "arg2", "reply", "reply type",
                  "comp_type", "tick count", "UUID")  # fmt: skip
-"""Every event has all of them, in this order."""
+"""Names of all fields, in the order in which an event has them."""
 
 
 class ReplyType(Enum):
@@ -51,7 +52,7 @@ class ReplyType(Enum):
     """It failed; `reply` says why."""
 
 
-_TYPES: Final[Mapping[str, ReplyType]] = {
+_REPLY_TYPES: Final[Mapping[str, ReplyType]] = {
     **{t.value: t for t in ReplyType},
     "SEND": ReplyType.SEND,
     "SENT": ReplyType.SEND,
@@ -83,19 +84,20 @@ class AcquilaEvent:
 
     @property
     def is_command(self) -> bool:
-        """Whether somebody is to execute it."""
+        """Whether the event asks its component to do something."""
         return self.reply_type is ReplyType.SEND
 
     @property
     def anonymous(self) -> bool:
-        """Whether the sender leaves it to the receiver to give it a UUID."""
+        """Whether the event has no UUID, so that the receiver assigns one."""
         return self.uuid in (0, "", "0")
 
     @property
     def key(self) -> float | str:
-        """What a command and its replies have in common: the UUID, even where it became a float.
+        """Key that a command and its replies share: the UUID as a float, else as text.
 
-        Of events without a UUID it is component and command.
+        Programs whose JSON has no integers return the UUID as a float. Without a UUID the
+        key is "component command".
 
         Example:
             >>> a, b = (AcquilaEvent("tube", "xrayon", uuid=u) for u in (2**63 + 1, float(2**63)))
@@ -109,20 +111,26 @@ class AcquilaEvent:
         return float(self.uuid)
 
     def answer(self, reply_type: ReplyType, reply: str = "", comp_type: str = "") -> AcquilaEvent:
-        """The event that replies to this one: same UUID, same tick count."""
+        """Make the event that replies to this one: same UUID, same tick count.
+
+        Args:
+            reply_type: RCV, FDB, ACK or ERR.
+            reply: text for the sender of the command.
+            comp_type: of the component that replies; left empty, that of this event.
+        """
         return replace(
             self, reply_type=reply_type, reply=reply, comp_type=comp_type or self.comp_type
         )
 
 
 def parse_event(data: bytes | str) -> AcquilaEvent:
-    """Read one event.
+    """Parse one event from JSON.
 
-    Missing texts are empty, as is null; numbers in arguments are taken as they are written.
+    Missing and null texts become "", numbers in arguments their text.
 
     Raises:
-        AcquilaError: not a JSON object with a component and a command, or a field that is too long
-            or holds what no event can carry.
+        AcquilaError: not a JSON object with a component and a command, or a field that is
+            too long or holds what no event can carry.
     """
     if len(data) > MAX_BYTES:
         raise AcquilaError(f"an event of {len(data)} bytes; allowed: {MAX_BYTES}")
@@ -137,7 +145,7 @@ def parse_event(data: bytes | str) -> AcquilaEvent:
     read["command"] = " ".join(read["command"].split())
     if not read["component"] or not read["command"]:
         raise AcquilaError("an event needs a component and a command")
-    kind = _TYPES.get(read["reply_type"].strip().upper())
+    kind = _REPLY_TYPES.get(read["reply_type"].strip().upper())
     if kind is None:
         raise AcquilaError(
             f"reply type {read['reply_type']!r}; allowed: empty (a command), RCV, FDB, ACK, ERR"
@@ -149,18 +157,19 @@ def parse_event(data: bytes | str) -> AcquilaEvent:
 
 
 def format_event(event: AcquilaEvent) -> str:
-    """One event as JSON, with every field."""
+    """Encode an event as JSON, with every field."""
     content = {name: getattr(event, _attribute(name)) for name in FIELDS}
     content["reply type"] = event.reply_type.value
     return json.dumps(content, ensure_ascii=False)
 
 
 class Exchange:
-    """The replies to one command: `received` first, `feedback` while it lasts, then one end.
+    """Makes the replies to one command: `received` first, `feedback` while it lasts, then
+    one end.
 
     Args:
-        command: what was asked; its UUID is already given.
-        comp_type: of the component, for the replies.
+        command: the command, with its UUID already assigned.
+        comp_type: type of the component, for the replies.
         now: real time [s].
     """
 
@@ -169,34 +178,35 @@ class Exchange:
 
     @property
     def next_feedback(self) -> float:
-        """When the next FDB is due [s]."""
+        """Real time at which the next FDB is due [s]."""
         return self._last + FEEDBACK_S
 
     def received(self, now: float) -> AcquilaEvent:
-        """RCV; the first event of every exchange."""
+        """Make the RCV event, the first of every exchange, at time `now` [s]."""
         self._last = now
         return self.command.answer(ReplyType.RCV, "", self._type)
 
     def feedback(self, text: str, now: float) -> AcquilaEvent:
-        """FDB, due or not."""
+        """Make an FDB event at time `now` [s], whether one is due or not."""
         self._last = now
         return self.command.answer(ReplyType.FDB, text, self._type)
 
     def done(self, reply: str = "") -> AcquilaEvent:
-        """ACK, the end."""
+        """Make the ACK event, which ends the exchange."""
         return self.command.answer(ReplyType.ACK, reply, self._type)
 
     def failed(self, message: str) -> AcquilaEvent:
-        """ERR, the end."""
+        """Make the ERR event, which ends the exchange."""
         return self.command.answer(ReplyType.ERR, message, self._type)
 
 
 def _attribute(name: str) -> str:
-    """The attribute of `AcquilaEvent` that holds the field called `name`."""
+    """Return the attribute of `AcquilaEvent` that holds the field called `name`."""
     return name.lower().replace(" ", "_")
 
 
 def _text(content: Mapping[str, object], name: str) -> str:
+    """Read a text field; a number or a truth value becomes the text that scripts use."""
     value = content.get(name, "")
     match value:
         case None:
@@ -211,10 +221,11 @@ def _text(content: Mapping[str, object], name: str) -> str:
 
 
 def _plain(name: str, text: str) -> str:
+    """Check a field's length and characters, and return the text unchanged."""
     if len(text) > MAX_CHARS[name]:
         raise AcquilaError(f"{name} of {len(text)} characters; allowed: {MAX_CHARS[name]}")
-    if (found := (_SURROGATE if name in FREE else _UNPRINTABLE).search(text)) is not None:
-        but = "surrogates" if name in FREE else "surrogates and control characters"
+    if (found := (_SURROGATE if name in BINARY_FIELDS else _UNPRINTABLE).search(text)) is not None:
+        but = "surrogates" if name in BINARY_FIELDS else "surrogates and control characters"
         raise AcquilaError(
             f"{name} holds U+{ord(found[0]):04X} at {found.start()}; allowed: anything but {but}"
         )
@@ -222,13 +233,15 @@ def _plain(name: str, text: str) -> str:
 
 
 def _whole(value: object) -> int:
+    """Convert a tick count to an integer; return 0 for anything else than a number below
+    2^64."""
     if isinstance(value, bool) or not isinstance(value, int | float) or value != value:
         return 0
     return int(value) if abs(value) < 2**64 else 0
 
 
 def _uuid(value: object) -> int | float | str:
-    """As it came; null is 0, which asks for one."""
+    """Return a UUID unchanged, or 0 for null; raise AcquilaError for other types."""
     if isinstance(value, str):
         return _plain("UUID", value)
     if value is None:

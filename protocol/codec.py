@@ -22,14 +22,14 @@ MAX_DEPTH = 200
 """Deepest nesting of a document (the JSON parser's own limit)."""
 
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
-"""Before JSON it says nothing, and .NET writes it at the beginning of a stream."""
+"""UTF-8 byte order mark; dropped before JSON, because .NET begins a stream with it."""
 
-LARGE = 1 << 16
-"""Bytes of a binary value that is encoded in pieces."""
-A_PIECE = 3 << 16
-"""Bytes of such a piece; a multiple of three, as base64 wants."""
-_MARK = secrets.token_hex(16)
-_TO_VISIT = (dict, list, msgpack.Timestamp)
+MIN_PIECEWISE_BYTES = 1 << 16
+"""Smallest binary value that is encoded in pieces [bytes]."""
+PIECE_BYTES = 3 << 16
+"""Size of a piece [bytes]; a multiple of three, as base64 needs."""
+_PLACEHOLDER = secrets.token_hex(16)
+_NESTED_TYPES = (dict, list, msgpack.Timestamp)
 
 
 class Codec(Enum):
@@ -40,18 +40,19 @@ class Codec(Enum):
 
 
 def read_json(data: bytes | bytearray | memoryview) -> object:
-    """One JSON document.
+    """Parse one JSON document; a leading byte order mark is dropped.
 
     Raises:
         ValueError: says what is wrong and where; a name that an object has twice is, too.
     """
     raw = bytes(data).removeprefix(BYTE_ORDER_MARK)
     document = from_json(raw, allow_inf_nan=False)
-    _NAMES.decode(raw.decode())
+    _UNIQUE_NAME_DECODER.decode(raw.decode())
     return document
 
 
 def _unique(pairs: list[tuple[str, object]]) -> None:
+    """Raise ValueError if an object has one name twice."""
     seen: set[str] = set()
     for name, _ in pairs:
         if name in seen:
@@ -59,24 +60,25 @@ def _unique(pairs: list[tuple[str, object]]) -> None:
         seen.add(name)
 
 
-# The fast parser keeps the last of equal names without a word. Numbers are not read again.
-_NAMES = json.JSONDecoder(object_pairs_hook=_unique, parse_int=str, parse_float=str)
+# The fast parser silently keeps the last of equal names. Numbers are not parsed a second time.
+_UNIQUE_NAME_DECODER = json.JSONDecoder(object_pairs_hook=_unique, parse_int=str, parse_float=str)
 
 
 def write_json(document: object) -> bytes:
-    """One JSON document on one line, pure ASCII, bytes as base64.
+    """Encode a document as one line of ASCII JSON, with bytes as base64.
 
     Raises:
-        ValueError, TypeError: something that JSON cannot hold (NaN, an unknown object).
+        ValueError, TypeError: a value that JSON cannot hold (NaN, an unknown object).
     """
     return b"".join(json_pieces(document))
 
 
 def json_pieces(document: object) -> list[bytes]:
-    """As `write_json`, in pieces: large binary values bypass the JSON encoder.
+    """Encode like `write_json`, in pieces; large binary values bypass the encoder.
 
-    The encoder writes an unguessable mark in place of each large value; the marks are then replaced
-    by the value's base64, so that no second copy of the whole document is ever made.
+    The encoder writes an unguessable mark in place of each large value; the marks are
+    then replaced by the value's base64, so that no second copy of the whole document is
+    ever made.
 
     Raises:
         ValueError, TypeError: as there.
@@ -86,22 +88,25 @@ def json_pieces(document: object) -> list[bytes]:
     def default(value: object) -> object:
         if not isinstance(value, (bytes, bytearray, memoryview)):
             return _plain(value)
-        if len(value) < LARGE:
+        if len(value) < MIN_PIECEWISE_BYTES:
             return base64.b64encode(value).decode("ascii")
         large.append(memoryview(value).cast("B"))
-        return f"{_MARK}{len(large) - 1}"
+        return f"{_PLACEHOLDER}{len(large) - 1}"
 
     text = json.dumps(document, allow_nan=False, separators=(",", ":"), default=default)
     left, out = text.encode("ascii"), list[bytes]()
     for i, value in enumerate(large):
-        head, _, left = left.partition(f"{_MARK}{i}".encode())
+        head, _, left = left.partition(f"{_PLACEHOLDER}{i}".encode())
         out.append(head)
-        out += [base64.b64encode(value[at : at + A_PIECE]) for at in range(0, len(value), A_PIECE)]
+        out += [
+            base64.b64encode(value[at : at + PIECE_BYTES])
+            for at in range(0, len(value), PIECE_BYTES)
+        ]
     return [*out, left]
 
 
 def read_msgpack(data: bytes | bytearray | memoryview) -> object:
-    """One MessagePack object, strings as UTF-8, binary as bytes.
+    """Parse one MessagePack object, with strings as UTF-8 and binary values as bytes.
 
     Raises:
         ValueError: says what is wrong.
@@ -134,24 +139,25 @@ def read_msgpack(data: bytes | bytearray | memoryview) -> object:
 
 
 def write_msgpack(document: object) -> bytes:
-    """One MessagePack object; bytes stay raw.
+    """Encode a document as one MessagePack object; bytes stay raw.
 
     Raises:
-        ValueError, TypeError, OverflowError: something that MessagePack cannot hold.
+        ValueError, TypeError, OverflowError: a value that MessagePack cannot hold.
     """
     packed: bytes = msgpack.packb(document, use_bin_type=True, default=_plain)
     return packed
 
 
 def _check_depth(document: object) -> None:
+    """Raise ValueError for nesting deeper than `MAX_DEPTH`, or for a timestamp."""
     level: list[object] = [document]
     for _ in range(MAX_DEPTH + 1):
         inner: list[object] = []
         for value in level:
             if isinstance(value, dict):
-                inner.extend(v for v in value.values() if isinstance(v, _TO_VISIT))
+                inner.extend(v for v in value.values() if isinstance(v, _NESTED_TYPES))
             elif isinstance(value, list):
-                inner.extend(v for v in value if isinstance(v, _TO_VISIT))
+                inner.extend(v for v in value if isinstance(v, _NESTED_TYPES))
             elif isinstance(value, msgpack.Timestamp):
                 raise ValueError("timestamps are not allowed")
         if not inner:
@@ -161,10 +167,12 @@ def _check_depth(document: object) -> None:
 
 
 def _no_extension(code: int, data: bytes) -> object:
+    """Reject a MessagePack extension type with a ValueError."""
     raise ValueError(f"extension type {code} is not allowed")
 
 
 def _plain(value: object) -> object:
+    """Convert models, arrays, NumPy numbers, sets and mappings to plain Python values."""
     match value:
         case BaseModel():
             return value.model_dump(mode="python")

@@ -33,24 +33,27 @@ MAX_FRAME: Final = 2**24 - 1
 MAX_ANSWER: Final[Mapping[Codec, int]] = {Codec.JSON: 64 << 20, Codec.MSGPACK: MAX_FRAME}
 """Largest answer [bytes] of a method that can tell its size before it makes the answer."""
 
-LARGE: Final = 1 << 16
-"""A message above this size [bytes] is sent in pieces, and does not overtake others."""
+MAX_OVERTAKING_BYTES: Final = 1 << 16
+"""Larger messages are sent in pieces and do not overtake others [bytes]."""
 
-SMALL: Final = 2**16 - 1
-"""Payloads up to this size [bytes] are simply copied (and have a shorter header)."""
+MAX_COPIED_BYTES: Final = 2**16 - 1
+"""Payloads up to this size are copied into the head and have a shorter header [bytes]."""
 
-_EMPTY: Final = b"\xc4\x00"
+_EMPTY_BIN: Final = b"\xc4\x00"
 _BIN32: Final = b"\xc6"
-_MARK: Final = b"\xa4data\xc6"
-_WINDOWS: Final = (4096, 2**20)
-_ATTEMPTS: Final = 4
+_DATA_BIN32: Final = b"\xa4data\xc6"
+_HEAD_WINDOWS_BYTES: Final = (4096, 2**20)
+_MAX_SPLIT_ATTEMPTS: Final = 4
 
 _size = struct.Struct(">I").unpack_from
 _HTTP: Final = re.compile(rb"[!#$%&'*+.^_`|~0-9A-Za-z-]+ [^ ]* HTTP/|host[ \t]*:", re.IGNORECASE)
-"""How a line of an HTTP request's head begins: TOKEN SP TARGET SP HTTP/, or the field `Host` (RFC
-9112, 3 and 3.2). A browser sends methods of any name, and always a Host; no JSON begins so."""
+"""Start of a line of an HTTP request: TOKEN SP TARGET SP HTTP/, or the field `Host`.
+
+RFC 9112, 3 and 3.2. A browser sends methods of any name, and always a Host; no JSON
+begins so.
+"""
 _HTTP_MARKS: Final = b" http/", b"host"
-"""What bytes in lower case hold if one of their lines may begin so."""
+"""Lower-case bytes of which received data holds one if a line may match `_HTTP`."""
 
 
 class Prepared:
@@ -61,10 +64,10 @@ class Prepared:
         self._pieces: dict[Codec, list[bytes]] = {}
 
     def encoded(self, codec: Codec) -> list[bytes]:
-        """The message's bytes, framing included, in pieces."""
+        """Return the message's bytes, framing included, in pieces; encode at most once."""
         if codec not in self._pieces:
             pieces = _framed(codec, _body(codec, self.message))
-            small = sum(map(len, pieces)) <= LARGE
+            small = sum(map(len, pieces)) <= MAX_OVERTAKING_BYTES
             self._pieces[codec] = [b"".join(pieces)] if small else pieces
         return self._pieces[codec]
 
@@ -75,7 +78,7 @@ class Connection:
     Args:
         codec: of this connection; None (a server) takes it from the first byte received.
         max_message: largest line or frame accepted [bytes].
-        max_batch: most messages in one batch.
+        max_batch: largest number of messages in one batch.
     """
 
     def __init__(
@@ -86,21 +89,21 @@ class Connection:
         self.max_batch = max_batch
         self.closed = False
         self._ready = deque[bytes | Malformed]()
-        """Whole messages, and errors found in dividing; empty lines are none."""
+        """Complete messages that `overtake` has examined, and errors found in dividing."""
         self._new = deque[bytes | Malformed]()
-        """Those that follow and that `overtake` has not examined."""
+        """The messages after these, not examined yet."""
         self._fed = 0
-        """How many of `_new` had come before the last `feed`."""
+        """Number of messages in `_new` before the last `feed`."""
         self._suspect = False
-        """Whether `overtake` has found a name in `_new` and not come to its end since."""
+        """Whether `_new` contains an urgent name that `overtake` has still to reach."""
         self._held = 0
-        """Bytes of all these."""
+        """Bytes in `_ready` and `_new`."""
         self._begun = bytearray()
-        """The beginning of a message whose end has not come."""
+        """The received part of an incomplete message."""
         self._skip = 0
-        """Bytes that are still to come of a frame that was refused, or 1 for the rest of a line."""
+        """Bytes of a rejected frame still to be skipped, or 1 for the rest of a rejected line."""
         self._broken = False
-        """Whether nothing that comes is received any more: an error that is fatal waits."""
+        """Whether a fatal error waits in the queue, so that further bytes are ignored."""
 
     @property
     def pending(self) -> int:
@@ -110,12 +113,12 @@ class Connection:
 
     @property
     def waiting(self) -> int:
-        """How many messages wait to be taken out."""
+        """Number of complete messages that wait to be taken out."""
         return len(self._ready) + len(self._new)
 
     @property
     def whole(self) -> bool:
-        """Whether `next_raw` has something to return."""
+        """Whether a complete message waits, so that `next_raw` returns something."""
         return bool(self._ready or self._new)
 
     @property
@@ -124,7 +127,8 @@ class Connection:
         return bool(self._begun) or self._skip > 0
 
     def receive_data(self, data: bytes | bytearray | memoryview) -> list[Message]:
-        """Take bytes from the peer; return the messages they complete, in order."""
+        """Receive bytes from the peer and decode the messages that they complete, in
+        order."""
         self.feed(data)
         out: list[Message] = []
         while (raw := self.next_raw()) is not None:
@@ -132,7 +136,7 @@ class Connection:
         return out
 
     def receive_end(self) -> None:
-        """The peer has ended the stream; nothing is received after this.
+        """End reception: the peer has ended the stream.
 
         Raises:
             ProtocolError: it ended inside a message, so that message is lost.
@@ -143,7 +147,7 @@ class Connection:
             raise ProtocolError(f"the stream ended inside a message, of which {held} bytes came")
 
     def feed(self, data: bytes | bytearray | memoryview) -> None:
-        """Take bytes from the peer without decoding them: see `next_raw`."""
+        """Receive bytes without decoding them; `next_raw` returns the complete messages."""
         self._fed = len(self._new)
         if self.closed or self._broken or not data:
             return
@@ -155,6 +159,7 @@ class Connection:
             self._feed_frames(data)
 
     def _feed_lines(self, data: bytes) -> None:
+        """Divide JSON lines; a chunk of many short lines is split at once."""
         first, last = data.find(b"\n") + 1, data.rfind(b"\n") + 1
         if first == last or len(data) > self.max_message or _may_hold_http(data):
             self._feed_each_line(data)
@@ -168,6 +173,7 @@ class Connection:
             self._begun += data[last:]
 
     def _feed_each_line(self, data: bytes) -> None:
+        """Divide JSON lines one by one; reject HTTP and lines that are too long."""
         *ends, rest = data.split(b"\n")
         for end in ends:
             line = bytes(self._begun) + end
@@ -191,6 +197,7 @@ class Connection:
             self._refuse(too_large("a line", f"at least {came}", self.max_message))
 
     def _feed_frames(self, data: bytes | bytearray | memoryview) -> None:
+        """Divide MessagePack frames; skip the rest of one that is too long."""
         skipped = min(self._skip, len(data))
         self._skip -= skipped
         begun, at = self._begun, 0
@@ -216,13 +223,13 @@ class Connection:
         del begun[:at]
 
     def _refuse(self, error: RpcError, *, fatal: bool = False) -> None:
-        """Put an error where the message would be, of which nothing is kept."""
+        """Queue `error` in place of the message that it is about, and drop that message."""
         self._new.append(Malformed(error, fatal=fatal))
         self._broken = fatal
         self._begun.clear()
 
     def next_raw(self) -> bytes | Malformed | None:
-        """The next message's bytes for `decode`, or an error found before that; None: no more."""
+        """Take out the next message's bytes, or an error; None if none waits."""
         if not self.whole:
             return None
         raw = (self._ready or self._new).popleft()
@@ -233,7 +240,7 @@ class Connection:
         return raw
 
     def decode(self, raw: bytes) -> Message:
-        """The message in the bytes that `next_raw` returned."""
+        """Decode the bytes that `next_raw` returned; malformed ones become `Malformed`."""
         read = codecs.read_msgpack if self.codec is Codec.MSGPACK else codecs.read_json
         try:
             document = read(raw)
@@ -249,16 +256,17 @@ class Connection:
     def overtake(
         self, names: Collection[bytes], wanted: Callable[[bytes], bool], most: int = 32
     ) -> list[bytes]:
-        """Take urgent messages out of their turn.
+        """Take out urgent messages before their turn.
 
-        Every whole message up to `LARGE` is examined once: first its bytes are searched for
-        `names`, which is fast, and only a message with a match is passed to `wanted`, which may
-        decode it.
+        Every message up to `MAX_OVERTAKING_BYTES` is examined once: first its bytes are
+        searched for `names`, which is fast, and only a message with a match is passed to
+        `wanted`, which may decode it.
 
         Args:
-            names: of the methods looked for, as bytes.
-            wanted: whether the message with these bytes is to be taken out.
-            most: messages passed to `wanted` in one call; `unjudged` tells whether there are more.
+            names: names of urgent methods, as bytes.
+            wanted: returns whether the message with these bytes is taken out.
+            most: largest number of messages passed to `wanted` in one call; `unjudged` is
+                then true if more remain.
 
         Returns:
             The bytes of the messages taken out, in order.
@@ -283,7 +291,8 @@ class Connection:
         return out
 
     def holds(self, name: bytes) -> bool:
-        """Whether a message that the last `feed` has completed contains these bytes."""
+        """Return whether a message completed by the last `feed` contains the bytes
+        `name`."""
         return name in _joined(islice(self._new, self._fed, None))
 
     def _end(self) -> None:
@@ -295,7 +304,7 @@ class Connection:
         self._held = self._skip = 0
 
     def send(self, message: Message | Prepared) -> bytes:
-        """The bytes of a message, framing included; JSON until the peer's first byte is known.
+        """Encode a message, framing included; as JSON until the codec is known.
 
         Raises:
             ValueError, TypeError: the message holds a value that cannot be encoded.
@@ -305,20 +314,20 @@ class Connection:
         return pieces[0] if len(pieces) == 1 else b"".join(pieces)
 
     def pieces(self, message: Message | Prepared) -> list[bytes]:
-        """As `send`, in pieces, so that large values are not copied."""
+        """Encode like `send`, in pieces, so that large values are not copied."""
         if isinstance(message, Prepared):
             return message.encoded(self.codec or Codec.JSON)
         return self.framed(self.body(message))
 
     def body(self, message: Message) -> list[bytes]:
-        """As `pieces`, without framing."""
+        """Encode like `pieces`, without framing."""
         return _body(self.codec or Codec.JSON, message)
 
     def batch(self, bodies: Sequence[Sequence[bytes]]) -> list[bytes]:
-        """Several messages in one document, without framing.
+        """Join encoded messages into one batch document, without framing.
 
         Args:
-            bodies: of the messages, at most 65 535.
+            bodies: bodies of the messages, from `body`; at most 65 535.
         """
         if self.codec is Codec.MSGPACK:
             return [_array_head(len(bodies)), *chain.from_iterable(bodies)]
@@ -328,7 +337,7 @@ class Connection:
         return [*out, b"]"]
 
     def framed(self, body: Sequence[bytes]) -> list[bytes]:
-        """A body with its framing.
+        """Add framing to an encoded body.
 
         Raises:
             RpcError: -32008, a MessagePack frame of 16 MiB or more.
@@ -337,23 +346,25 @@ class Connection:
 
 
 def _may_hold_http(data: bytes) -> bool:
-    """Whether lines have to be looked at one by one for the head of an HTTP request."""
+    """Return whether each line must be checked for the head of an HTTP request."""
     lower = data.lower()
     return any(mark in lower for mark in _HTTP_MARKS)
 
 
 def _joined(messages: Iterable[bytes | Malformed]) -> bytes:
-    """The small ones in one piece, to be searched; of 10^4 messages in a millisecond."""
-    return b"\n".join([m for m in messages if isinstance(m, bytes) and len(m) <= LARGE])
+    """Join the small messages into one piece for a search (10^4 take a millisecond)."""
+    return b"\n".join(
+        [m for m in messages if isinstance(m, bytes) and len(m) <= MAX_OVERTAKING_BYTES]
+    )
 
 
 def _small(message: bytes | Malformed) -> TypeGuard[bytes]:
-    """Whether it is a message, and short enough for a look while others wait."""
-    return isinstance(message, bytes) and len(message) <= LARGE
+    """Return whether this is a message short enough to be decoded while others wait."""
+    return isinstance(message, bytes) and len(message) <= MAX_OVERTAKING_BYTES
 
 
 def encoded(result: object, codec: Codec) -> Encoded:
-    """A result that is encoded before its answer is made.
+    """Encode a result ahead of its answer, in the connection's codec.
 
     Raises:
         ValueError, TypeError, OverflowError: it holds a value that cannot be encoded.
@@ -362,6 +373,7 @@ def encoded(result: object, codec: Codec) -> Encoded:
 
 
 def _body(codec: Codec, message: Message) -> list[bytes]:
+    """Encode a message without framing; an `Encoded` result is inserted as it is."""
     match message:
         case Response(id, Encoded(pieces)) if codec is Codec.JSON:
             return [b'{"jsonrpc":"2.0","id":%b,"result":' % codecs.write_json(id), *pieces, b"}"]
@@ -372,20 +384,23 @@ def _body(codec: Codec, message: Message) -> list[bytes]:
 
 
 def _pieces(codec: Codec, document: object) -> list[bytes]:
+    """Encode a document in pieces."""
     json = codec is Codec.JSON
     return codecs.json_pieces(document) if json else [codecs.write_msgpack(document)]
 
 
 def _framed(codec: Codec, body: Sequence[bytes]) -> list[bytes]:
+    """Add the newline of JSON lines, or the length of a MessagePack frame."""
     return [*body, b"\n"] if codec is Codec.JSON else [frame_head(sum(map(len, body))), *body]
 
 
 def _array_head(count: int) -> bytes:
+    """Return the MessagePack header of an array of `count` items."""
     return bytes([0x90 | count]) if count < 16 else struct.pack(">BH", 0xDC, count)
 
 
 def frame_head(size: int) -> bytes:
-    """The length in front of a MessagePack frame of so many bytes.
+    """Return the length prefix of a MessagePack frame of `size` bytes.
 
     Raises:
         RpcError: -32008, 16 MiB or more.
@@ -396,7 +411,7 @@ def frame_head(size: int) -> bytes:
 
 
 def pack(message: Message) -> tuple[bytes, memoryview | None]:
-    """The bytes of a frame: length and head, and the payload that follows (or None).
+    """Encode a frame as its length and head, and the payload that follows (or None).
 
     Raises:
         RpcError: -32008, a frame of 16 MiB or more.
@@ -414,53 +429,54 @@ def pack(message: Message) -> tuple[bytes, memoryview | None]:
     finally:
         inner["data"] = data
     size = payload.nbytes
-    head = head[: -len(_EMPTY)] + _BIN32 + size.to_bytes(4, "big")
+    head = head[: -len(_EMPTY_BIN)] + _BIN32 + size.to_bytes(4, "big")
     return frame_head(len(head) + size) + head, payload
 
 
 def unpack(body: memoryview) -> Message:
-    """The message of a frame's body; a large last `data` is a view into `body`."""
+    """Decode a frame's body; a large last `data` becomes a view into `body`."""
     try:
-        document = _split(body) if len(body) > SMALL else None
+        document = _split(body) if len(body) > MAX_COPIED_BYTES else None
         return from_plain(codecs.read_msgpack(body) if document is None else document)
     except ValueError as error:
         return Malformed(parse_error(str(error)))
 
 
 def _large(data: object) -> memoryview | None:
+    """Return a view of `data` if it is binary and larger than `MAX_COPIED_BYTES`, else None."""
     if not isinstance(data, (bytes, bytearray, memoryview)):
         return None
     view = memoryview(data)
-    return view if view.nbytes > SMALL else None
+    return view if view.nbytes > MAX_COPIED_BYTES else None
 
 
 def _split(body: memoryview) -> object | None:
-    """The document with `data` a view of `body`, or None if it has no such last member.
+    """Decode a frame with `data` as a view of `body`, or return None.
 
-    The head of the frame is searched for `data` with a 32-bit length that reaches exactly to the
-    end of the frame. The same bytes may occur inside another value, so each candidate is decoded
-    without its payload before it is believed; a few attempts are enough for honest messages and
-    bound the work for others.
+    The head of the frame is searched for `data` with a 32-bit length that reaches exactly
+    to the end of the frame. The same bytes may occur inside another value, so each
+    candidate is decoded without its payload first; the number of attempts is bounded,
+    which limits the work that a hostile frame can cause.
     """
     attempts = 0
-    for window in _WINDOWS:
+    for window in _HEAD_WINDOWS_BYTES:
         head = bytes(body[:window])
-        at = head.find(_MARK)
-        while 0 <= at <= len(head) - len(_MARK) - 4 and attempts < _ATTEMPTS:
-            start = at + len(_MARK) + 4
+        at = head.find(_DATA_BIN32)
+        while 0 <= at <= len(head) - len(_DATA_BIN32) - 4 and attempts < _MAX_SPLIT_ATTEMPTS:
+            start = at + len(_DATA_BIN32) + 4
             if start + int.from_bytes(head[start - 4 : start], "big") == len(body):
                 attempts += 1
                 document = _with_payload(head[: start - 5], body[start:])
                 if document is not None:
                     return document
-            at = head.find(_MARK, at + 1)
+            at = head.find(_DATA_BIN32, at + 1)
     return None
 
 
 def _with_payload(head: bytes, payload: memoryview) -> object | None:
-    """The document of `head` with `payload` as its last `data`, if that is what it lacks."""
+    """Decode `head` and put `payload` in place of its last `data`; None if it lacks none."""
     try:
-        document = codecs.read_msgpack(head + _EMPTY)
+        document = codecs.read_msgpack(head + _EMPTY_BIN)
     except ValueError:
         return None  # the mark was inside something else
     inner = _innermost(document)
@@ -471,7 +487,7 @@ def _with_payload(head: bytes, payload: memoryview) -> object | None:
 
 
 def _innermost(document: object) -> dict[str, Any] | None:
-    """The last nested map whose last member is `data`."""
+    """Return the last nested map whose last member is `data`, or None."""
     while isinstance(document, dict) and document:
         key = next(reversed(document))
         if key == "data":

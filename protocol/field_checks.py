@@ -13,16 +13,18 @@ from pydantic import (
 from flexdt.protocol import image
 from flexdt.protocol.rpc_errors import RpcError
 
-_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
-_BUT_LINES = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff]")
+_CONTROL_CHARACTER = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+_CONTROL_BUT_LINE_END = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff]")
 MAX_STEM = 100
-"""Bytes of a name, percent-encoded: it becomes a file's name, with a date before and a suffix."""
+"""Longest name, percent-encoded [bytes]: it becomes a file name, with a date and a
+suffix."""
 MAX_SIDE_MM = 1e4
 """Longest side of a grid of voxels [mm]."""
 
 
 def few(most: int) -> BeforeValidator:
-    """Make a validator that rejects an object of more than `most` members before it reads any."""
+    """Make a validator that rejects an object of more than `most` members before it reads
+    any."""
 
     def check(value: object) -> object:
         if isinstance(value, Mapping) and len(value) > most:
@@ -33,7 +35,7 @@ def few(most: int) -> BeforeValidator:
 
 
 def payload(value: object) -> object:
-    """Read binary data: base64 text, or bytes."""
+    """Decode binary data: base64 text, or bytes."""
     try:
         return bytes(image.payload(value))
     except RpcError as error:
@@ -41,7 +43,7 @@ def payload(value: object) -> object:
 
 
 def no_truth(value: object) -> object:
-    """Check that a value is not true or false, which Python takes for numbers."""
+    """Check that a value is not true or false, which Python accepts as numbers."""
     if isinstance(value, bool):
         raise ValueError("a number is needed, not true or false")
     return value
@@ -53,22 +55,22 @@ def encoded(name: str) -> str:
 
 
 def line(value: str) -> str:
-    """Check that a text has no control characters and line ends."""
-    if _CONTROL.search(value):
+    """Check that a text has no control characters or line ends."""
+    if _CONTROL_CHARACTER.search(value):
         raise ValueError("control characters and line ends are not allowed")
     return value
 
 
 def lines(value: str) -> str:
-    """Check that a text has no control characters but TAB and line ends."""
-    if _BUT_LINES.search(value):
+    """Check that a text has no control characters except TAB and line ends."""
+    if _CONTROL_BUT_LINE_END.search(value):
         raise ValueError("control characters but TAB and line ends are not allowed")
     return value
 
 
 def plain_name(value: str) -> str:
     """Check that a name can become a file's name."""
-    if "/" in value or "\\" in value or _CONTROL.search(value):
+    if "/" in value or "\\" in value or _CONTROL_CHARACTER.search(value):
         raise ValueError("a name may hold anything but /, \\ and control characters")
     if (size := len(encoded(value))) > MAX_STEM:
         raise ValueError(
@@ -79,7 +81,12 @@ def plain_name(value: str) -> str:
 
 
 def require_extent(shape: tuple[int, ...], voxel_mm: tuple[float, ...]) -> None:
-    """Raise ValueError where a grid of `shape` (z, y, x) and `voxel_mm` (x, y, z) is too large."""
+    """Check that no side of a grid of `shape` (z, y, x) and `voxel_mm` (x, y, z) is too
+    long.
+
+    Raises:
+        ValueError: a side is longer than `MAX_SIDE_MM`.
+    """
     side = max(n * v for n, v in zip(reversed(shape), voxel_mm, strict=True))
     if side > MAX_SIDE_MM:
         raise ValueError(

@@ -34,10 +34,11 @@ from flexdt.protocol.field_checks import (
 from flexdt.protocol.image import Dtype
 
 MAX_UNKNOWN = 50
-"""An object with this many members more than it has fields is rejected without a closer look."""
+"""Largest number of members beyond the declared fields before an object is rejected
+unread."""
 
 _MODEL = ConfigDict(frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True)
-"""Of all models; the text below a field is its description in the OpenRPC document."""
+"""Configuration of all models; the text below a field is its description in OpenRPC."""
 Payload = Annotated[
     bytes,
     BeforeValidator(payload),
@@ -131,6 +132,7 @@ class Params(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _few(cls, value: object) -> object:
+        """Reject an object with far more members than fields before they are validated."""
         fields = cls.model_fields
         if isinstance(value, Mapping) and len(value) > len(fields) + MAX_UNKNOWN:
             raise ValueError(f"{len(value)} members; allowed: {', '.join(fields) or 'none'}")

@@ -24,7 +24,10 @@ DTYPES: tuple[str, ...] = get_args(Dtype)
 
 
 def encode(array: npt.NDArray[np.generic]) -> dict[str, object]:
-    """An array as an image value; `data` is a read-only view where the layout allows.
+    """Convert an array to an image value; `data` is a read-only view where the layout allows.
+
+    Returns:
+        {"dtype": name, "shape": sizes, "data": little-endian bytes in C order}.
 
     Raises:
         ValueError: a dtype that is not in `DTYPES`.
@@ -38,7 +41,8 @@ def encode(array: npt.NDArray[np.generic]) -> dict[str, object]:
 
 
 def decode(value: Mapping[str, object]) -> npt.NDArray[np.generic]:
-    """The array of an image value, read-only and without a copy where `data` is bytes.
+    """Convert an image value to an array, read-only, without a copy where `data` is
+    bytes.
 
     Raises:
         RpcError: -32602, naming what does not fit.
@@ -55,7 +59,7 @@ def decode(value: Mapping[str, object]) -> npt.NDArray[np.generic]:
 def from_bytes(
     data: bytes | memoryview, dtype: str, shape: Sequence[int]
 ) -> npt.NDArray[np.generic]:
-    """Raw little-endian bytes as a read-only array of `shape`.
+    """View raw little-endian bytes as a read-only array of `shape`.
 
     Raises:
         RpcError: -32602, the number of bytes does not match.
@@ -75,7 +79,7 @@ def from_bytes(
 
 
 def payload(data: object) -> bytes | memoryview:
-    """Bytes of a `data` field: raw bytes as they are, text as base64.
+    """Return the bytes of a `data` field: raw bytes unchanged, base64 text decoded.
 
     Raises:
         RpcError: -32602, neither bytes nor base64.
@@ -94,10 +98,12 @@ def payload(data: object) -> bytes | memoryview:
 
 
 def _wire_dtype(name: str) -> np.dtype[np.generic]:
+    """Return the little-endian dtype of a name in `DTYPES`."""
     return np.dtype(name).newbyteorder("<")
 
 
 def _shape(value: object) -> tuple[int, ...]:
+    """Check that a shape is a list of up to four sizes."""
     if (
         not isinstance(value, (list, tuple))
         or len(value) > 4

@@ -41,7 +41,7 @@ Id = str | int | float | None
 """A request's id: text or number; None only where the request's own id could not be read."""
 
 Params = Mapping[str, object] | list[object] | None
-_KINDS: Mapping[type, str] = {
+_JSON_TYPE_NAMES: Mapping[type, str] = {
     dict: "an object", list: "a list", str: "text", bool: "a truth value",
     int: "a number", float: "a number", type(None): "null", bytes: "bytes",
 }  # fmt: skip
@@ -116,11 +116,12 @@ Message = Single | Batch
 
 
 def event(topic: str, seq: int, time: float, data: object) -> Notification:
-    """An event notification, `{topic, seq, time, data}` on the wire.
+    """Make an event notification, `{topic, seq, time, data}` on the wire.
 
     Args:
         topic: state, projection, job or log.
-        seq: counts the topic's events; a gap means that newer values have replaced older ones.
+        seq: counts the topic's events; a gap means that newer values have replaced older
+            ones.
         time: the twin's clock [s].
         data: as the topic's model has it.
     """
@@ -128,7 +129,7 @@ def event(topic: str, seq: int, time: float, data: object) -> Notification:
 
 
 def to_plain(message: Message) -> object:
-    """The dict (or list, for a batch) that a codec writes."""
+    """Convert a message to the dict (or the list, for a batch) that a codec encodes."""
     match message:
         case Request(id, method, params):
             return _call({"jsonrpc": "2.0", "id": id, "method": method}, params)
@@ -148,9 +149,9 @@ def to_plain(message: Message) -> object:
 
 
 def finite(data: object) -> object:
-    """`data` of an error, with NaN and infinities as text because JSON has no numbers for them.
+    """Replace NaN and infinities in the `data` of an error by text; JSON has no such numbers.
 
-    An error repeats the value it is about, and that may have overflowed on the way.
+    An error repeats the value that it is about, and that may have overflowed.
     """
     match data:
         case float():
@@ -163,7 +164,7 @@ def finite(data: object) -> object:
 
 
 def from_plain(document: object, max_batch: int = 1000) -> Message:
-    """The message in a decoded document; a batch may hold at most `max_batch` messages."""
+    """Convert a decoded document to a message; batches of at most `max_batch`."""
     if not isinstance(document, list):
         return _single(document)
     if not document:
@@ -174,12 +175,14 @@ def from_plain(document: object, max_batch: int = 1000) -> Message:
 
 
 def _call(plain: dict[str, object], params: Params) -> dict[str, object]:
+    """Add `params` to a call unless it has none."""
     if params is not None:
         plain["params"] = params
     return plain
 
 
 def _single(document: object) -> Single:
+    """Convert one document; anything wrong becomes `Malformed` with its id."""
     if not isinstance(document, dict):
         return Malformed(invalid_request(f"expected an object, got {_kind(document)}"))
     id = document.get("id")
@@ -199,6 +202,7 @@ def _single(document: object) -> Single:
 
 
 def _request(document: dict[object, object], id: Id) -> Single:
+    """Read a request, or a notification if the document has no id."""
     method, params = document["method"], document.get("params")
     extra = [clip(k, 40) for k in document if k not in ("jsonrpc", "id", "method", "params")]
     if extra:
@@ -214,6 +218,7 @@ def _request(document: dict[object, object], id: Id) -> Single:
 
 
 def _failure(id: Id, error: object) -> Single:
+    """Read the answer to a failed request."""
     if isinstance(error, dict):
         code, message = error.get("code"), error.get("message")
         if type(code) is int and isinstance(message, str):
@@ -222,15 +227,17 @@ def _failure(id: Id, error: object) -> Single:
 
 
 def _valid_id(id: object) -> bool:
+    """Return whether an id is text, a finite number or null."""
     if isinstance(id, float):
         return math.isfinite(id)
     return id is None or isinstance(id, str) or type(id) is int
 
 
 def _kind(value: object) -> str:
+    """Name the JSON type of a value, for error messages."""
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
-    return _KINDS.get(type(value), type(value).__name__)
+    return _JSON_TYPE_NAMES.get(type(value), type(value).__name__)
 
 
 class Role(Enum):
@@ -248,7 +255,7 @@ class Answered(Generic[_W]):
     answer: Response | Failure
 
     def result(self) -> object:
-        """The result of the request.
+        """Return the result of the request.
 
         Raises:
             RpcError: the answer is an error.
@@ -284,24 +291,26 @@ class Correlation(Generic[_W]):
         self.reason: RpcError | None = None
         self.violation: ProtocolError | None = None
         self._ids = itertools.count(1)
-        # Requests sent and not answered. The waiter is None once nobody waits any more: the
-        # answer may still come, and it is not one that nobody asked for.
-        self._asked: dict[Id, _W | None] = {}
+        # Requests sent and not answered. The waiter of an abandoned request is None; its answer may
+        # still come and is no violation.
+        self._open_requests: dict[Id, _W | None] = {}
         # Requests received and not answered; a client may use an id twice at the same time.
-        self._owed: Counter[Id] = Counter()
+        self._owed_answers: Counter[Id] = Counter()
 
     # -- the client's side -------------------------------------------------------------------
 
     def request(
         self, method: str, params: Mapping[str, object], waiter: _W, trace: str = ""
     ) -> Request:
-        """A request to send, with a new id.
+        """Make a request with a new id and register who waits for its answer.
 
         Args:
-            method: its name.
-            params: by name; what cannot be encoded is found when the message is sent.
-            waiter: comes back with the answer.
-            trace: put in front of the id, so that the server's log shows what caused the request.
+            method: name of the method.
+            params: by name; a value that cannot be encoded is found when the message is
+                sent.
+            waiter: returned with the answer.
+            trace: prefix of the id, so that the server's log shows what caused the
+                request.
 
         Raises:
             TypeError: a name in `params` is not text, which no server could read.
@@ -309,63 +318,69 @@ class Correlation(Generic[_W]):
         _require_text_names(params, method)
         number = next(self._ids)
         id: Id = f"{trace}/{number}" if trace else number
-        self._asked[id] = waiter
+        self._open_requests[id] = waiter
         return Request(id, method, dict(params))
 
     def abandon(self, request: Request, *, sent: bool = True) -> None:
-        """Stop waiting for an answer.
+        """Stop waiting for an answer; one that still comes is dropped.
 
         Args:
             request: made by `request`.
             sent: False if no byte of it was sent, so that no answer can come.
         """
         if not sent:
-            self._asked.pop(request.id, None)
-        elif request.id in self._asked:
-            self._asked[request.id] = None
+            self._open_requests.pop(request.id, None)
+        elif request.id in self._open_requests:
+            self._open_requests[request.id] = None
 
     def waiter(self, id: object) -> _W | None:
-        """Who waits for the answer with this id, if anybody does."""
-        return self._asked.get(id) if isinstance(id, (int, str)) else None
+        """Return the waiter for the answer with this id, or None."""
+        return self._open_requests.get(id) if isinstance(id, (int, str)) else None
 
     def waiting(self) -> list[_W]:
-        """Everybody who waits for an answer, oldest request first."""
-        return [waiter for waiter in self._asked.values() if waiter is not None]
+        """Return all waiters, oldest request first."""
+        return [waiter for waiter in self._open_requests.values() if waiter is not None]
 
     # -- the server's side -------------------------------------------------------------------
 
     def owes(self, id: Id) -> bool:
-        """Whether a request of this id has no answer yet."""
-        return self._owed[id] > 0
+        """Return whether a received request of this id has no answer yet."""
+        return self._owed_answers[id] > 0
 
     def answer(self, answer: Response | Failure) -> Response | Failure:
-        """The answer, if it is to a request of the client that has none yet.
+        """Check that an answer belongs to an open request, and close that request.
 
         An error without id is about the connection and always allowed.
+
+        Returns:
+            The answer, unchanged.
 
         Raises:
             LookupError: no open request has this id.
         """
         if isinstance(answer, Response) or answer.id is not None:
-            if not self._owed[answer.id]:
+            if not self._owed_answers[answer.id]:
                 raise LookupError(f"no open request has the id {answer.id!r}")
-            self._owed[answer.id] -= 1
-            if not self._owed[answer.id]:
-                del self._owed[answer.id]  # a long connection has many ids
+            self._owed_answers[answer.id] -= 1
+            if not self._owed_answers[answer.id]:
+                del self._owed_answers[answer.id]  # a long connection has many ids
         return answer
 
     @property
     def open(self) -> int:
-        """How many requests have no answer yet: sent by a client, received by a server."""
-        return len(self._asked) if self.role is Role.CLIENT else self._owed.total()
+        """Number of requests without an answer: sent by a client, received by a server."""
+        return len(self._open_requests) if self.role is Role.CLIENT else self._owed_answers.total()
 
     # -- both sides --------------------------------------------------------------------------
 
     def receive(self, message: Message) -> list[Answered[_W] | Request | Notification]:
-        """What a message means here; the items of a batch one by one.
+        """Match a message from the peer to the open requests, item by item for a batch.
 
-        Answers that nobody waits for any more are left out. A malformed message is the answer to
-        the request whose id it has; on a server it must be answered by the caller, with `reply`.
+        Answers to abandoned requests are dropped. A malformed message with an id counts
+        as the answer to that request; on a server the caller must answer it with `reply`.
+
+        Returns:
+            Calls, and answers with their waiters.
 
         Raises:
             ProtocolError: the peer may not send this.
@@ -380,10 +395,10 @@ class Correlation(Generic[_W]):
             case Notification():
                 return [message]
             case Failure(None, RpcError(code=Code.PARSE)):
-                # The server could not read one of our requests, not even its id, so no other
-                # answer to that one will come; which one it was nobody knows.
-                waiting = [(id, w) for id, w in self._asked.items() if w is not None]
-                self._asked.update((id, None) for id, _ in waiting)
+                # The server could not read one of our requests, not even its id. Which request
+                # failed is unknown, so all of them fail.
+                waiting = [(id, w) for id, w in self._open_requests.items() if w is not None]
+                self._open_requests.update((id, None) for id, _ in waiting)
                 return [Answered(waiter, message) for _, waiter in waiting]
             case Failure(None, error) | Malformed(error, None):
                 self.reason = error
@@ -397,46 +412,53 @@ class Correlation(Generic[_W]):
         raise self._violated(f"the server sent a request ({clip(message.method, 40)})")
 
     def violate(self, violation: ProtocolError) -> None:
-        """Note that the peer's bytes break the protocol (see `Connection.receive_end`)."""
+        """Record that the peer's bytes break the protocol (see `Connection.receive_end`)."""
         self.violation = violation
 
     def _settle(self, answer: Response | Failure) -> list[Answered[_W] | Request | Notification]:
-        if answer.id not in self._asked:
+        """Match an answer to its request and close the request."""
+        if answer.id not in self._open_requests:
             raise self._violated(
                 f"an answer to a request that is not open (id {clip(answer.id, 40)})"
             )
-        waiter = self._asked.pop(answer.id)
+        waiter = self._open_requests.pop(answer.id)
         return [] if waiter is None else [Answered(waiter, answer)]
 
     def _receive_call(self, message: Message) -> list[Answered[_W] | Request | Notification]:
+        """Register a client's call as open."""
         match message:
             case Request(id):
-                self._owed[id] += 1
+                self._owed_answers[id] += 1
                 return [message]
             case Notification():
                 return [message]
             case Malformed(_, id):
-                self._owed[id] += id is not None
+                self._owed_answers[id] += id is not None
                 return []
         raise self._violated("an answer to a server, which asks nothing")
 
     def _violated(self, what: str) -> ProtocolError:
+        """Record a violation of the protocol and return it."""
         self.violation = ProtocolError(what)
         return self.violation
 
 
 def hello_params(client: str, token: str | None) -> dict[str, object]:
-    """Parameters of `session.hello`, with which every connection of a client begins.
+    """Make the parameters of `session.hello`, with which a client begins.
 
     Args:
         client: name of the program, for people who look at the server.
-        token: where the server wants one.
+        token: where the server requires one.
+
+    Returns:
+        {"protocol": version, "client": name}, and "token" if there is one.
     """
     params: dict[str, object] = {"protocol": PROTOCOL, "client": client}
     return params if token is None else {**params, "token": token}
 
 
 def _require_text_names(value: object, where: str) -> None:
+    """Raise TypeError if a name in nested `value` is not text."""
     if isinstance(value, Mapping):
         for name, inner in value.items():
             if not isinstance(name, str):

@@ -63,15 +63,15 @@ by_hand = partial(Method, control=True, by_hand=True)
 
 
 def compatible(protocol: str) -> bool:
-    """Whether a server of this version serves a client that speaks `protocol`."""
+    """Return whether a server of this version serves a client that speaks `protocol`."""
     return protocol.split(".")[0] == PROTOCOL.split(".")[0]
 
 
 def require_compatible(protocol: str) -> None:
-    """Refuse a client of another protocol.
+    """Reject a client of another protocol version.
 
     Raises:
-        RpcError: -32602, says what is spoken here.
+        RpcError: -32602, with the version of this server.
     """
     if not compatible(protocol):
         raise invalid_params(
@@ -84,7 +84,7 @@ def require_compatible(protocol: str) -> None:
 def parse_params(
     method: Method[_P, Result], given: Mapping[str, object] | list[object] | None
 ) -> _P:
-    """Validated parameters of a call, given by name, by position, or not at all.
+    """Validate the parameters of a call, given by name, by position, or not at all.
 
     Raises:
         RpcError: -32602, every problem with its path and what was asked.
@@ -104,10 +104,10 @@ def parse_params(
 
 
 def parse_result(model: type[_M], given: object) -> _M:
-    """A result as its model (for clients).
+    """Validate a result against its model (for clients).
 
     Raises:
-        RpcError: -32603, the server answered something else than the protocol says.
+        RpcError: -32603, the server's answer does not match the protocol.
     """
     try:
         return model.model_validate(given)
@@ -117,6 +117,7 @@ def parse_result(model: type[_M], given: object) -> _M:
 
 
 def _explain(method: str, error: ValidationError, allowed: list[str]) -> RpcError:
+    """Convert a validation error to -32602; list at most 50 problems with path and value."""
     problems: list[dict[str, object]] = []
     for e in error.errors()[:50]:
         problem: dict[str, object] = {

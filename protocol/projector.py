@@ -107,11 +107,12 @@ class VoxelGrid(f.Params):
 
     @property
     def nbytes(self) -> int:
-        """Of its values on the wire."""
+        """Size of the voxels' values on the wire [bytes]."""
         return 4 * math.prod(self.shape)
 
     @model_validator(mode="after")
     def _extent(self) -> VoxelGrid:
+        """Check that no side is too long."""
         require_extent(self.shape, self.voxel_mm)
         return self
 
@@ -128,7 +129,7 @@ class MeshSize(f.Params):
 
     @property
     def nbytes(self) -> int:
-        """Of its numbers on the wire."""
+        """Size of the mesh's numbers on the wire [bytes]."""
         return 24 * self.vertices + 12 * self.triangles
 
 
@@ -152,6 +153,8 @@ class VolumePut(f.Params):
 
     @model_validator(mode="after")
     def _one(self) -> VolumePut:
+        """Check that exactly one of scene, grid and mesh is given, and data where it
+        belongs."""
         if sum(one is not None for one in (self.scene, self.grid, self.mesh)) != 1:
             raise ValueError("give one of scene, grid, mesh")
         if (self.scene is None) != (self.data is not None):

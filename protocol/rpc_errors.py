@@ -19,7 +19,7 @@ class Code(IntEnum):
     meaning: str
 
     def __new__(cls, code: int, meaning: str) -> Code:
-        """A code with its meaning."""
+        """Make a code with its meaning."""
         member = int.__new__(cls, code)
         member._value_, member.meaning = code, meaning
         return member
@@ -65,17 +65,17 @@ class ProtocolError(Exception):
 
 
 def parse_error(why: str) -> RpcError:
-    """The bytes are no JSON document or no MessagePack object."""
+    """Make the error for bytes that are not a JSON document or MessagePack object."""
     return RpcError(Code.PARSE, f"parse error: {why}")
 
 
 def invalid_request(why: str) -> RpcError:
-    """The document is no JSON-RPC 2.0 message."""
+    """Make the error for a document that is not a JSON-RPC 2.0 message."""
     return RpcError(Code.INVALID_REQUEST, f"invalid request: {why}")
 
 
 def method_not_found(asked: str, allowed: Iterable[str]) -> RpcError:
-    """No method of that name; lists the methods there are."""
+    """Make the error for an unknown method; it lists the methods."""
     names = sorted(allowed)
     return RpcError(
         Code.METHOD_NOT_FOUND,
@@ -87,7 +87,7 @@ def method_not_found(asked: str, allowed: Iterable[str]) -> RpcError:
 def invalid_params(
     message: str, problems: Sequence[Mapping[str, object]] = (), allowed: object = None
 ) -> RpcError:
-    """Make the error for parameters that do not fit; `problems` are those of `problem`."""
+    """Make the error for parameters that do not fit; `problems` are made by `problem`."""
     data: dict[str, object] = {"problems": [dict(p) for p in problems]}
     if allowed is not None:
         data["allowed"] = allowed
@@ -95,30 +95,39 @@ def invalid_params(
 
 
 def problem(path: str, message: str, asked: object) -> dict[str, object]:
-    """Make one entry of `invalid_params`: the parameter, what is wrong, and what was asked for."""
+    """Make one entry of `invalid_params`: the parameter's path, what is wrong, the value
+    given."""
     return {"path": path, "message": message, "asked": asked}
 
 
 def internal(trace: str | None = None) -> RpcError:
-    """Something failed inside the server; `trace` is the id under which its log has the details."""
+    """Make the error for a failure of the server; its log has the details under the id
+    `trace`."""
     message = "internal error; the server's log has the details"
     return RpcError(Code.INTERNAL, message, None if trace is None else {"trace": trace})
 
 
 def busy(message: str, data: object = None) -> RpcError:
-    """A job runs, or somebody else is the controller."""
+    """Make the error for a running job, or for a client that does not hold control."""
     return RpcError(Code.BUSY, message, data)
 
 
 def not_authorised() -> RpcError:
-    """No token, or a wrong one."""
+    """Make the error for a missing or wrong token."""
     message = "a valid token is needed: session.hello {token}"
     data = {"allowed": "session.hello with the server's token"}
     return RpcError(Code.NOT_AUTHORISED, message, data)
 
 
 def too_large(what: str, asked: float | str, allowed: float, unit: str = "bytes") -> RpcError:
-    """Something above its stated size."""
+    """Make the error for something above its allowed size.
+
+    Args:
+        what: the thing, with its article.
+        asked: its size, in `unit`.
+        allowed: largest size, in `unit`.
+        unit: unit of both.
+    """
     return RpcError(
         Code.TOO_LARGE,
         f"{what} of {asked} {unit} is too large; at most {allowed} {unit}",
@@ -127,29 +136,31 @@ def too_large(what: str, asked: float | str, allowed: float, unit: str = "bytes"
 
 
 def superseded(key: str) -> RpcError:
-    """A newer request with the same key took this one's place."""
+    """Make the error for a request that a newer one with the same key replaced."""
     return RpcError(Code.SUPERSEDED, f"superseded by a newer request for {key!r}", {"key": key})
 
 
 def link_down(why: str) -> RpcError:
-    """There is no connection to the twin, or it was lost before the answer came."""
+    """Make the error for a request without a connection to the twin, or one that was
+    lost."""
     return RpcError(Code.LINK_DOWN, f"no connection to the twin: {why}")
 
 
 def cancelled(request: object) -> RpcError:
-    """The sender cancelled this request."""
+    """Make the error for a request that its sender cancelled."""
     return RpcError(Code.CANCELLED, "cancelled by its sender", {"request": request})
 
 
 def clip(value: object, limit: int = 200) -> str:
-    """Text of `value` for a message, at most `limit` characters; no more of it is even read."""
+    """Convert `value` to text of at most `limit` characters, without formatting more of
+    it."""
     text = value[: limit + 1] if isinstance(value, str) else _brief(value, limit)
     text = text.encode("utf-8", "backslashreplace").decode("utf-8")  # no lone surrogates
     return text if len(text) <= limit else text[:limit] + "..."
 
 
 def _brief(value: object, limit: int) -> str:
-    """Like `repr`, but not of what would be cut off anyway."""
+    """Format like `repr`, but skip the parts that would be cut off."""
     some = limit // 2
     match value:
         case str() | bytes() | bytearray():

@@ -33,7 +33,7 @@ METHODS: Final[Mapping[str, AnyMethod]] = {
 
 
 def find(name: str, methods: Mapping[str, AnyMethod] = METHODS) -> AnyMethod:
-    """The method called `name`.
+    """Look up the method called `name`.
 
     Raises:
         RpcError: -32601, listing the methods.
@@ -46,11 +46,15 @@ def find(name: str, methods: Mapping[str, AnyMethod] = METHODS) -> AnyMethod:
 def openrpc_document(
     methods: Mapping[str, AnyMethod] = METHODS, *, title: str = "flexdt twin server"
 ) -> dict[str, Any]:
-    """The OpenRPC document of a server as plain data (https://spec.open-rpc.org, version 1.3).
+    """Make the OpenRPC document of a server as plain data (https://spec.open-rpc.org,
+    version 1.3).
 
     Args:
-        methods: its method table.
-        title: its name.
+        methods: method table of the server.
+        title: title of the document.
+
+    Returns:
+        A dict with the keys openrpc, info, methods and components.
     """
     models: list[type[BaseModel]] = [m.params for m in methods.values()]
     models += [m.result for m in methods.values()]
@@ -81,6 +85,7 @@ def openrpc_document(
 
 
 def _method(method: AnyMethod, schemas: Mapping[str, Any], result: str) -> dict[str, Any]:
+    """Describe one method as OpenRPC does; `result` is the reference to its schema."""
     schema = schemas[method.params.__name__]
     required = schema.get("required", [])
     params = []

@@ -49,6 +49,7 @@ class ScriptInput(f.Params):
 
     @model_validator(mode="after")
     def _one(self) -> ScriptInput:
+        """Check that exactly one of text and data_base64 is given."""
         if (self.text is None) == (self.data_base64 is None):
             raise ValueError("give either text or data_base64")
         return self
@@ -93,6 +94,7 @@ class JobForget(f.Params):
 
     @model_validator(mode="after")
     def _one(self) -> JobForget:
+        """Check that exactly one of job and days is given."""
         if (self.job is None) == (self.days is None):
             raise ValueError("give either job or days")
         return self

@@ -25,7 +25,7 @@ from flexdt.protocol.state_model import (
 Bytes = Annotated[int, Ge(0), Le(2**53)]
 """A place in, or a size of, something sent in parts [bytes]."""
 MESH_CHUNK = 4 << 20
-"""Bytes of a mesh in one answer: below a frame, also as base64."""
+"""Longest part of a mesh in one answer [bytes]; its base64 fits into a frame."""
 LengthUnit = Literal["um", "mm", "cm", "m", "inch"]
 MeshFormat = Literal["stl", "obj", "ply", "glb", "off"]
 VoxelFormat = Literal["raw"]
@@ -150,6 +150,7 @@ class SampleSet(f.Params):
 
     @model_validator(mode="after")
     def _one(self) -> SampleSet:
+        """Check that exactly one of name and file is given."""
         if (self.name is None) == (self.file is None):
             raise ValueError("give either name or file")
         return self
@@ -187,6 +188,7 @@ class SampleUpload(f.Params):
 
     @model_validator(mode="after")
     def _fits(self) -> SampleUpload:
+        """Check that the chunk fits into the total, and that format and kind agree."""
         if self.start + len(self.data) > self.total:
             raise ValueError(f"chunk ends at {self.start + len(self.data)}, total is {self.total}")
         own = KINDS[self.format]

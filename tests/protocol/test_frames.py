@@ -22,7 +22,7 @@ from flexdt.protocol import (
     image,
 )
 from flexdt.protocol.codec import write_json
-from flexdt.protocol.connection import SMALL, pack, unpack
+from flexdt.protocol.connection import MAX_COPIED_BYTES, pack, unpack
 
 
 def whole(message: Message) -> bytes:
@@ -30,7 +30,10 @@ def whole(message: Message) -> bytes:
     return head + (b"" if payload is None else bytes(payload))
 
 
-@given(st.sampled_from([0, 1, SMALL, SMALL + 1, 200_000]), st.sampled_from(["result", "params"]))
+@given(
+    st.sampled_from([0, 1, MAX_COPIED_BYTES, MAX_COPIED_BYTES + 1, 200_000]),
+    st.sampled_from(["result", "params"]),
+)
 def test_the_bytes_are_those_of_an_ordinary_frame(size: int, where: str) -> None:
     data = np.arange(size, dtype=np.uint8)
     value = image.encode(data)
@@ -60,7 +63,7 @@ def test_a_payload_with_a_long_header_travels_by_itself(size: int, copied: bool)
 
 
 def test_packing_leaves_the_message_as_it_was() -> None:
-    value = image.encode(np.zeros(SMALL, np.float32))
+    value = image.encode(np.zeros(MAX_COPIED_BYTES, np.float32))
     before = value["data"]
     pack(Response(1, value))
     assert value["data"] is before
@@ -82,7 +85,11 @@ def test_bytes_that_look_like_a_payload_do_not_mislead() -> None:
 
 @given(st.binary(max_size=40), st.binary(max_size=40), st.integers(0, 100))
 def test_hostile_bodies_never_raise(head: bytes, tail: bytes, off: int) -> None:
-    filling = b"\xa4data\xc6" + (SMALL + off).to_bytes(4, "big") + b"\x00" * (SMALL + 50)
+    filling = (
+        b"\xa4data\xc6"
+        + (MAX_COPIED_BYTES + off).to_bytes(4, "big")
+        + b"\x00" * (MAX_COPIED_BYTES + 50)
+    )
     for body in (head, head + filling + tail):
         unpack(memoryview(body))
 
