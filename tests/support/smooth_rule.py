@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from flexdt.twin.script.planning.planned_images import FULL_TURN, run_up
+from flexdt.twin.script.planning.planned_images import FULL_TURN_DEG, run_up
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ def smooth_scan(
     acceleration: float,
     *,
     first: float = 0.0,
-    turn: float = FULL_TURN,
+    turn: float = FULL_TURN_DEG,
 ) -> SmoothScan:
     """Apply the rule to `frames` >= 2 images over `turn`, the last of them at first + turn.
 

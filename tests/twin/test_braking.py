@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from flexdt.twin.machine.description import builtin_machine
 from flexdt.twin.motion import profiles as motion
-from flexdt.twin.motion.braking import PATH_ERROR, braked_along, braked_apart
+from flexdt.twin.motion.braking import PATH_TOLERANCE, braked_along, braked_apart
 from flexdt.twin.motion.drives import Drive
 from flexdt.twin.motion.profiles import Piece, Trajectory
 
@@ -82,7 +82,7 @@ def test_a_stop_along_the_path_stays_on_it_and_within_each_motors_limits(
     stop = braked_along(drives, now, most)
     if not stop:
         return
-    assert distance_to_path(drives, stop, now) <= 2.0 * PATH_ERROR + 1e-6
+    assert distance_to_path(drives, stop, now) <= 2.0 * PATH_TOLERANCE + 1e-6
     for name, way in stop.items():
         before = drives[name].at(now)
         assert way.position(now) == pytest.approx(before.position(now), abs=1e-7)
@@ -233,7 +233,7 @@ def test_a_stop_while_motors_speed_up_is_cut_no_finer_than_its_error_asks(
         "mag_det": Drive(50.0, 50.0, (motion.move(0.0, 0.0, -3000.0, 30.0, 50.0, 0.0),)),
     }
     stop = braked_along(drives, 2.0, {"mag_obj": most, "mag_det": most})
-    assert 0.1 * PATH_ERROR < distance_to_path(drives, stop, 2.0) <= PATH_ERROR
+    assert 0.1 * PATH_TOLERANCE < distance_to_path(drives, stop, 2.0) <= PATH_TOLERANCE
 
 
 def test_a_stop_shorter_than_the_clock_tells_is_a_rest() -> None:

@@ -16,7 +16,8 @@ from flexdt.twin.errors import LimitError
 
 _MODE = re.compile(r"(?:\d+_)?HW(\d+)SW(\d+)(High|Low)", re.IGNORECASE)
 
-FORM: Final = "HWaSWbHigh or HWaSWbLow with binning factors a, b"
+MODE_FORM: Final = "HWaSWbHigh or HWaSWbLow with binning factors a, b"
+"""Form of camera mode names, for error messages."""
 
 
 @dataclass(frozen=True)
@@ -52,21 +53,22 @@ class PixelGrid:
 
     @property
     def edges_mm(self) -> tuple[float, float]:
-        """Pitch from column to column and from row to row."""
+        """Pitch from column to column and from row to row [mm]."""
         return self.pitch_mm, self.pitch_mm if self.row_pitch_mm is None else self.row_pitch_mm
 
     @property
     def size_mm(self) -> tuple[float, float]:
-        """Width and height of the active area."""
+        """Width and height of the active area [mm]."""
         across, up = self.edges_mm
         return self.columns * across, self.rows * up
 
 
 @dataclass(frozen=True)
 class CameraSettings:
-    """What the camera is set to; `frames` and `averages` are counts, exposure is in ms.
+    """Settings of the camera; `frames` and `averages` are counts, exposure is in ms.
 
-    `modes` are the detector's modes whose names do not tell their binning: (name, binning).
+    `modes` are the detector's modes whose names do not tell their binning: (name,
+    binning).
     """
 
     mode: str
@@ -83,13 +85,13 @@ class CameraSettings:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Image (rows, cols); a surplus that does not fill a binned pixel is cut off."""
+        """Image shape (rows, cols); a rest that does not fill a binned pixel is cut off."""
         b, r = self.binning, self.roi
         return (r.bottom - r.top + 1) // b, (r.right - r.left + 1) // b
 
     @property
     def of_image(self) -> dict[str, Any]:
-        """What each image is taken with, by name; the ROI as its edges."""
+        """Settings of an image, by name: mode, exposure_ms, roi (its edges), averages."""
         return {
             "mode": self.mode,
             "exposure_ms": self.exposure_ms,
@@ -99,26 +101,29 @@ class CameraSettings:
 
     @property
     def stated(self) -> dict[str, Any]:
-        """What is set, by name: `of_image` and the number of images."""
+        """All settings, by name: `of_image` and the number of frames."""
         return {**self.of_image, "frames": self.frames}
 
     def facts(self, grid: PixelGrid) -> dict[str, Any]:
-        """What is set and the image's `shape` and `pixel_mm`: the wire's camera."""
+        """Return the wire's camera: `stated`, and the image's `shape` and `pixel_mm`."""
         return {**self.stated, "shape": self.shape, "pixel_mm": self.pixel_mm(grid)}
 
     def pixel_mm(self, grid: PixelGrid) -> float:
-        """Binned pixel pitch from column to column [mm]."""
+        """Return the binned pixel pitch from column to column [mm]."""
         return grid.pitch_mm * self.binning
 
     def pixels_mm(self, grid: PixelGrid) -> tuple[float, float]:
-        """Binned pixel pitch from column to column and from row to row [mm]."""
+        """Return the binned pitch from column to column and from row to row [mm]."""
         across, up = grid.edges_mm
         return across * self.binning, up * self.binning
 
     def roi_shift_mm(self, grid: PixelGrid) -> tuple[float, float]:
-        """Shift of the image's centre from the sensor's: (columns growing, rows growing) [mm].
+        """Compute the shift of the image's centre from the sensor's centre [mm].
 
         For the thesis's ROI 32 8 1943 1527 that is (+1.1968, 0), as flexDATA has it.
+
+        Returns:
+            (along growing columns, along growing rows).
         """
         rows, cols = self.shape
         b, r = self.binning, self.roi
@@ -128,7 +133,7 @@ class CameraSettings:
 
 
 def binning_of(mode: str, modes: Mapping[str, int] | None = None) -> int:
-    """Binning a*b of camera mode `HWaSWb{High,Low}` (some machines prefix a number and `_`).
+    """Parse the binning a*b of camera mode `HWaSWb{High,Low}`, which may have a prefix `N_`.
 
     Args:
         mode: its name.
@@ -146,23 +151,23 @@ def binning_of(mode: str, modes: Mapping[str, int] | None = None) -> int:
         return named[mode.strip()]
     match = _MODE.fullmatch(mode.strip())
     if match is None or int(match[1]) * int(match[2]) == 0:
-        raise no_mode(mode, [*named, FORM])
+        raise no_mode(mode, [*named, MODE_FORM])
     return int(match[1]) * int(match[2])
 
 
 def no_mode(mode: str, allowed: Sequence[str]) -> LimitError:
-    """The error for a camera mode that is not among those `allowed`."""
+    """Make the error for a camera mode that is not among those `allowed`."""
     what = f"camera mode {mode!r} does not exist; allowed: {', '.join(allowed)}"
     return LimitError(what, {"asked": mode, "allowed": list(allowed)})
 
 
 def without_number(mode: str) -> str:
-    """A mode's name without the number that some machines prefix, in lower case."""
+    """Return a mode's name in lower case, without the number that some machines prefix."""
     return re.sub(r"^\d+_", "", mode.strip()).lower()
 
 
 def check_roi(roi: Roi, grid: PixelGrid, binning: int) -> Roi:
-    """Return `roi` if it lies on the sensor and holds at least one binned pixel.
+    """Check that `roi` lies on the sensor and holds at least one binned pixel; return it.
 
     Raises:
         LimitError: says which edge, its value and what is allowed.

@@ -30,7 +30,7 @@ from pydantic_core import PydanticCustomError
 from flexdt.twin.errors import LimitError, MachineFileError, TwinError, UnknownNameError
 from flexdt.twin.geometry.offsets import NAMES
 from flexdt.twin.machine.camera import (
-    FORM,
+    MODE_FORM,
     CameraSettings,
     PixelGrid,
     Roi,
@@ -50,56 +50,64 @@ Vector3 = tuple[Length, Length, Length]
 _M = TypeVar("_M", bound=BaseModel)
 QUANTITIES = ("source_x", "source_z", "object_x", "object_y", "object_z", "detector_x",
               "detector_y", "detector_z", "angle", "mount_x", "mount_y")  # fmt: skip
-"""What motors move, world frame: object_y is the SOD, detector_y the SDD, angle the stage's.
-mount_x and mount_y are those of a stage on the turntable: they turn with the sample and are along
-the world's x and y at angle 0."""
+"""Quantities that motors move, world frame: object_y is the SOD, detector_y the SDD.
+
+angle is the stage's. mount_x and mount_y are those of a stage on the turntable: they turn
+with the sample and are along the world's x and y at angle 0.
+"""
 _COMPONENTS_OF_SCRIPTS = ("camera", "tube", "scanner")
-"""Words of scripts that no axis may be called."""
-OUTSIDE = (
+"""Words of scripts that are not allowed as names of axes."""
+NOT_MODELLED = (
     "not modelled (docs/limits.md): source and detector that turn about the sample (C-arms, "
     "gantries), stages that tilt, curved panels, parallel beams"
 )
+"""Scanners that a machine file cannot describe, for error messages."""
 SAMPLE: Final = "sample"
-"""Name of the sample's pieces in pairs of bodies; no component may be called so."""
+"""Name of the sample's pieces in pairs of bodies; not allowed for a component."""
 _AREA_SLACK_MM: Final = 0.5
-"""By how much the panel's body may be smaller than the active area on each side: the FleX-ray's
-table has whole millimetres."""
+"""Amount by which the panel's body may be smaller than the active area on each side [mm].
+
+The FleX-ray's table has whole millimetres.
+"""
 MAX_POINTS: Final = 256
-"""Most corners of a convex part."""
+"""Largest number of corners of a convex part."""
 MAX_TIME_S: Final = 1e6
-"""No command takes longer [s]."""
+"""Longest time of a command [s]."""
 ZERO: Final = "zero"
 """Name of the profile without offsets."""
-_HELD: Final = {
+_CONTAINED_PLACES: Final = {
     "tube": "the focal spot, which is its 0, 0, 0",
     "sample_holder": "the rotation axis, which is its x = y = 0",
     "sample_mount": "the rotation axis, which is its x = y = 0",
     "panel": "the active area, whose centre is its 0, 0, 0",
 }
+"""Role of a component -> what its body must contain, for error messages."""
 Corners = Callable[[str], Sequence[Vector3]]
 """Reads a mesh file by the name that a machine file gives it: corners of a convex body around the
 mesh [mm, its own frame], at most `MAX_POINTS`."""
 Raw = dict[str, Any]
-_ONE: Final = "a machine has one tube and one flat panel, [tube] and [detector]"
-_LIMITS: Final = {
+_ONE_DETECTOR: Final = "a machine has one tube and one flat panel, [tube] and [detector]"
+_KEY_LIMITS: Final = {
     "beam": "the beam is a cone from one focal spot; parallel and fan beams are not modelled",
-    "tube": _ONE,
-    "source": _ONE,
-    "detector": _ONE,
+    "tube": _ONE_DETECTOR,
+    "source": _ONE_DETECTOR,
+    "detector": _ONE_DETECTOR,
     "shape": "curved panels and line detectors are not modelled",
     "unit": 'linear axes are in mm, axes with kind = "rotation" in deg',
     "kind": "axes slide or turn about the vertical; what tilts is not modelled",
 }
+"""Key of a machine file -> what docs/limits.md says of it, for error messages."""
 
 
 def _one_word(name: str) -> str:
+    """Check that a name is one printable word of at most 100 characters."""
     if not (0 < len(name) <= 100 and name.isprintable() and not any(c.isspace() for c in name)):
         raise PydanticCustomError("word", "must be one word, 1 to 100 printable characters")
     return name
 
 
 Name = Annotated[str, AfterValidator(_one_word)]
-"""Scripts separate their columns by tabs, and people theirs by spaces."""
+"""One word: scripts separate their columns by tabs, and people theirs by spaces."""
 
 
 class _Frozen(BaseModel):
@@ -131,6 +139,7 @@ class Axis(_Frozen):
 
     @model_validator(mode="after")
     def _ordered(self) -> Axis:
+        """Check that home, speed and acceleration are within their limits."""
         _refuse_if(self.lower > self.upper, "upper", self.upper, f"at least lower, {self.lower}")
         most = f"within lower and upper, [{self.lower}, {self.upper}]"
         _refuse_if(not self.lower <= self.home <= self.upper, "home", self.home, most)
@@ -155,6 +164,7 @@ class VirtualAxis(_Frozen):
 
     @model_validator(mode="after")
     def _reads_what_it_moves(self) -> VirtualAxis:
+        """Check that the axis reads a motor that it moves, at the inverse share."""
         _refuse_if(self.factor == 0.0, "factor", self.factor, "a number other than 0")
         most = f"shares of motors, {self.of!r} (the `of`) among them"
         _refuse_if(self.of not in self.moves, "moves", self.moves, most)
@@ -221,10 +231,13 @@ class DetectorSpec(_Frozen):
         return tuple(dict.fromkeys([self.mode, *self.modes, *own]))
 
     def check_mode(self, mode: str) -> str:
-        """`mode` if it exists; case and the number that some machines prefix do not matter.
+        """Check that a camera mode exists; case and a prefixed number do not matter.
 
         Raises:
             LimitError: lists the modes that exist.
+
+        Returns:
+            `mode`, unchanged.
         """
         own = {without_number(name) for name in self.mode_names if name not in self.modes}
         if mode.strip() not in self.modes and without_number(mode) not in own:
@@ -233,10 +246,11 @@ class DetectorSpec(_Frozen):
 
     @model_validator(mode="after")
     def _fits(self) -> DetectorSpec:
+        """Check that mode and ROI fit the panel, and that the response is physical."""
         try:
             binning = binning_of(self.mode, self.modes)
         except LimitError:
-            raise _refused("mode", self.mode, ", ".join([*self.modes, FORM])) from None
+            raise _refused("mode", self.mode, ", ".join([*self.modes, MODE_FORM])) from None
         try:
             check_roi(Roi(*self.roi), self.pixels, binning)
         except LimitError as error:
@@ -260,6 +274,7 @@ class FilterSpec(_Frozen):
     @field_validator("material")
     @classmethod
     def _known(cls, text: str) -> str:
+        """Check that the material is known."""
         from flexdt.twin.attenuation.substances import Substance
 
         Substance.called(text)
@@ -293,6 +308,7 @@ class TubeSpec(_Frozen):
 
     @model_validator(mode="after")
     def _starts_within(self) -> TubeSpec:
+        """Check that the settings at start are within the tube's limits."""
         most = f"from min_kV to max_kV, [{self.min_kV:g}, {self.max_kV:g}]"
         _refuse_if(not self.min_kV <= self.kV <= self.max_kV, "kV", self.kV, most)
         most = f"at most max_W, {self.max_W:g}"
@@ -302,7 +318,7 @@ class TubeSpec(_Frozen):
 
 
 def _box_around(points: Iterable[Vector3]) -> tuple[Vector3, Vector3]:
-    """Edges and centre of the upright box around points."""
+    """Compute size and centre of the upright box around points [mm]."""
     (x, x_), (y, y_), (z, z_) = ((min(c), max(c)) for c in zip(*points, strict=True))
     return (x_ - x, y_ - y, z_ - z), ((x + x_) / 2, (y + y_) / 2, (z + z_) / 2)
 
@@ -339,11 +355,12 @@ class Component(_Frozen):
     @field_validator("parent", "axis", mode="before")
     @classmethod
     def _none(cls, name: object) -> object:
-        """ "" takes away what the base has: TOML has no word for nothing."""
+        """Convert "", which removes what the base has, to None: TOML has no null."""
         return None if name == "" else name
 
     @model_validator(mode="after")
     def _round(self) -> Component:
+        """Check that size and centre agree with the shape."""
         if self.shape == "cylinder" and self.size_mm[0] != self.size_mm[1]:
             raise _refused("size_mm", self.size_mm, "as wide in x as in y, for a cylinder")
         if (self.shape == "hull") != bool(self.points_mm):
@@ -397,7 +414,7 @@ class Timing(_Frozen):
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """The kinds of commands that have a time here."""
+        """Kinds of commands that have a time here."""
         return tuple(
             name[:-2]
             for name in Timing.model_fields
@@ -405,17 +422,18 @@ class Timing(_Frozen):
         )
 
     def seconds(self, kind: str) -> float:
-        """The time of a kind of command [s]."""
+        """Return the time of a kind of command [s]."""
         value: float = getattr(self, f"{kind}_s")
         return value
 
     @property
     def sequence(self) -> str:
-        """The kind whose time a sequence of images takes beside its exposures."""
+        """Kind whose time a sequence of images takes beyond its exposures."""
         return "take_image_overhead" if self.sequence_overhead_s is None else "sequence_overhead"
 
     @model_validator(mode="after")
     def _spreads_hold(self) -> Timing:
+        """Check that each measured kind has a time, between p5_s and p95_s."""
         _require(self.spread, self.kinds, "spread", "kind of command")
         for kind, found in self.spread.items():
             middle = self.seconds(kind)
@@ -435,6 +453,7 @@ class EStop(_Frozen):
 
 
 def _known_offsets(priors: dict[str, float]) -> dict[str, float]:
+    """Check that priors name offsets."""
     for name in priors:
         if name not in NAMES:
             raise _refused(name, priors[name], f"a known offset: {', '.join(NAMES)}")
@@ -508,16 +527,22 @@ class Machine(_Frozen):
 
     @model_validator(mode="after")
     def _consistent(self) -> Machine:
-        _require(self.geometry, QUANTITIES, "geometry", "quantity", f"; {OUTSIDE}")
+        """Check what single tables cannot: names, kinds of axes, chains, roles, E-stop,
+        contacts.
+
+        Raises:
+            PydanticCustomError: names the key, its value and what is allowed.
+        """
+        _require(self.geometry, QUANTITIES, "geometry", "quantity", f"; {NOT_MODELLED}")
         slides = [quantity for quantity in QUANTITIES if quantity != "angle"]
-        _require(self.fixed, slides, "fixed", "quantity that slides", f"; {OUTSIDE}")
+        _require(self.fixed, slides, "fixed", "quantity that slides", f"; {NOT_MODELLED}")
         for quantity, factors in self.geometry.items():
             _require(factors, self.axes, f"geometry.{quantity}", "axis")
             kind = "rotation" if quantity == "angle" else "linear"
             for name, factor in factors.items():
                 most = "a number other than 0, or left out"
                 _refuse_if(factor == 0.0, f"geometry.{quantity}.{name}", factor, most)
-                most = f"driven by {kind} axes alone; {OUTSIDE}"
+                most = f"driven by {kind} axes alone; {NOT_MODELLED}"
                 _refuse_if(self.axes[name].kind != kind, f"geometry.{quantity}", name, most)
         for quantity in ("mount_x", "mount_y"):
             if quantity in self.fixed and not self.geometry.get(quantity):
@@ -548,7 +573,13 @@ class Machine(_Frozen):
         return self
 
     def _check_chains(self) -> None:
-        """Every component hangs on earlier ones, and its motors are those of its anchor, once."""
+        """Check the kinematic chains of the components.
+
+        A name is used once and is not the sample's; parents come first; a part's axis is
+        a motor of the machine that drives its anchor and occurs once in its chain; a
+        moved part has the anchor of its parent; a stage on the turntable is carried by
+        it.
+        """
         names = [c.name for c in self.components]
         for component in self.components:
             where = f"components.{component.name}"
@@ -586,10 +617,10 @@ class Machine(_Frozen):
             _refuse_if(twice is not None, f"components.{component.name}.axis", twice, most)
 
     def _check_roles(self) -> None:
-        """What stands for focal spot, active area and holder is where the X-ray geometry has them.
+        """Check that focal spot, active area and holder are where the X-ray geometry has them.
 
-        Otherwise a motor of `geometry` would move the image and leave the body behind, and what
-        collides would be called free.
+        Otherwise a motor of `geometry` would move the image and leave the body behind,
+        and what collides would be called free.
         """
         across, up = self.detector.pixels.size_mm
         for role, anchor, half in (
@@ -620,21 +651,22 @@ class Machine(_Frozen):
                 if part.shape == "cylinder":
                     beside[:2] = [math.hypot(beside[0], beside[1]), 0.0]
                 if any(b > side / 2 + slack for b, side in zip(beside, part.size_mm, strict=False)):
-                    most = f"such that the {part.shape}, {part.size_mm} mm, holds {_HELD[role]}"
+                    held = _CONTAINED_PLACES[role]
+                    most = f"such that the {part.shape}, {part.size_mm} mm, holds {held}"
                     raise _refused(f"{where}.center_mm", part.center_mm, most)
 
     def _on_turntable(self, motor: str) -> bool:
-        """Whether it moves a stage that turns with the sample."""
+        """Return whether a motor moves a stage that turns with the sample."""
         return any(motor in self.geometry.get(q, {}) for q in ("mount_x", "mount_y"))
 
     def _motors_of(self, anchor: str) -> list[str]:
-        """Motors that drive a quantity of `anchor` (the stage's angle turns what is on it)."""
+        """List the motors that drive a quantity of `anchor`."""
         quantities = [q for q in QUANTITIES if q.startswith(f"{anchor}_")]
         quantities += ["angle", "mount_x", "mount_y"] if anchor == "object" else []
         return [motor for q in quantities for motor in self.geometry.get(q, {})]
 
     def chain(self, component: Component) -> tuple[str, ...]:
-        """The motors that carry `component`, from itself up to what stands still."""
+        """List the motors that carry `component`, from itself up to what does not move."""
         parents = {c.name: c for c in self.components}
         motors: list[str] = []
         part: Component | None = component
@@ -644,11 +676,11 @@ class Machine(_Frozen):
         return tuple(motors)
 
     def has(self, axis: str) -> bool:
-        """Whether there is a motor or virtual axis of that name."""
+        """Return whether there is a motor or virtual axis of that name."""
         return axis in self.axes or axis in self.virtual_axes
 
     def moves(self, axis: str) -> Mapping[str, float]:
-        """Motor -> mm (deg) of it per mm (deg) of `axis`, a motor or a virtual axis; none is 0.
+        """Return motor -> mm (deg) of it per mm (deg) of `axis`, a motor or a virtual axis.
 
         Raises:
             UnknownNameError: lists the machine's axes.
@@ -660,7 +692,7 @@ class Machine(_Frozen):
         return self.virtual_axes[axis].moves
 
     def axis(self, name: str) -> Axis:
-        """The motor called `name`.
+        """Look up the motor called `name`.
 
         Raises:
             UnknownNameError: lists the machine's axes.
@@ -671,35 +703,41 @@ class Machine(_Frozen):
 
 
 def _refused(at: str, value: object, allowed: str) -> PydanticCustomError:
-    """An error of several keys together, reported at one of them; `at` is relative to the model."""
+    """Make an error of several keys together, reported at `at`, relative to the model."""
     context = {"at": at, "value": value, "allowed": allowed}
     return PydanticCustomError("refused", "must be {allowed}", context)
 
 
 def _refuse_if(wrong: bool, at: str, value: object, allowed: str) -> None:
+    """Raise `_refused` if `wrong`."""
     if wrong:
         raise _refused(at, value, allowed)
 
 
 def unknown_axis(name: str, machine: Machine) -> UnknownNameError:
-    """The error for an axis that `machine` does not have."""
+    """Make the error for an axis that `machine` does not have."""
     allowed = [*machine.axes, *machine.virtual_axes]
     return UnknownNameError.among(f"unknown axis {name!r}; {machine.name} has", name, allowed)
 
 
 def parse_machine(text: str, file: str = "<machine>", corners: Corners | None = None) -> Machine:
-    """Read a machine description.
+    """Parse a machine description.
 
-    `base = NAME` at the top of the text takes over all that it does not say from a machine that
-    ships, but for its zero offsets and for the axes and components that `without` lists. Tables are
-    merged key by key and components by their names; a quantity of `geometry` and `timing` are
-    replaced whole.
+    `base = NAME` at the top of the text inherits everything else from a machine that
+    ships, except its zero offsets and the axes and components that `without` lists.
+    Tables are merged key by key and components by their names; a quantity of `geometry`
+    and `timing` are replaced as a whole.
+
+    `base = NAME` at the top of the text takes over all that it does not say from a
+    machine that ships, but for its zero offsets and for the axes and components that
+    `without` lists. Tables are merged key by key and components by their names; a
+    quantity of `geometry` and `timing` are replaced whole.
 
     Args:
         text: TOML.
         file: name for error messages.
-        corners: reads the meshes that it names (`flexdt.library.machines.parsed` reads those
-            beside the file).
+        corners: reads the meshes that it names (`flexdt.library.machines.parsed` reads
+            those beside the file).
 
     Raises:
         MachineFileError: TOML or content does not hold; file, key path, value, allowed.
@@ -711,19 +749,19 @@ def parse_machine(text: str, file: str = "<machine>", corners: Corners | None = 
         path = f"axes.{idle[0]}" if idle else "geometry.angle"
         most = "in [geometry] with what it moves" if idle else "motors that turn the sample"
         raise MachineFileError(
-            f"{file}: {path}: must be {most}; {OUTSIDE}", {"file": file, "path": path}
+            f"{file}: {path}: must be {most}; {NOT_MODELLED}", {"file": file, "path": path}
         )
     return machine
 
 
 def parse_profile(text: str, file: str = "<profile>") -> Profile:
-    """Read a calibration profile from TOML; errors as `parse_machine`."""
+    """Parse a calibration profile from TOML; errors as `parse_machine`."""
     return _parse(Profile, dict, text, file)
 
 
 @lru_cache
 def builtin_machine(name: str = "flexray") -> Machine:
-    """A machine that ships with the package.
+    """Load a machine that ships with the package.
 
     Raises:
         UnknownNameError: lists the shipped machines.
@@ -733,7 +771,7 @@ def builtin_machine(name: str = "flexray") -> Machine:
 
 @lru_cache
 def builtin_profile(name: str) -> Profile:
-    """A calibration profile that ships with the package.
+    """Load a calibration profile that ships with the package.
 
     Raises:
         UnknownNameError: lists the shipped profiles.
@@ -742,12 +780,12 @@ def builtin_profile(name: str) -> Profile:
 
 
 def builtin_machine_text(name: str) -> str:
-    """The file of a machine that ships, comments and all; errors as `builtin_machine`."""
+    """Read the file of a machine that ships, with its comments; errors as `builtin_machine`."""
     return _data("machines", name)
 
 
 def profile_of(machine: Machine, name: str | None = None) -> Profile:
-    """The shipped profile `name` of a machine, or its default; none at all for one without.
+    """Load the shipped profile `name` of a machine, or its default, or one of zero offsets.
 
     Raises:
         UnknownNameError: lists the shipped profiles.
@@ -759,7 +797,7 @@ def profile_of(machine: Machine, name: str | None = None) -> Profile:
 
 
 def default_profile(machine: Machine, file: str) -> Profile:
-    """The profile that `machine` names as its own, or none (`profile_of`).
+    """Load the profile that `machine` names as its own, or one of zero offsets.
 
     Args:
         machine: whose.
@@ -780,22 +818,24 @@ def default_profile(machine: Machine, file: str) -> Profile:
 
 
 def builtin_machines() -> tuple[str, ...]:
-    """Names of the shipped machines."""
+    """List the names of the shipped machines."""
     return _names("machines")
 
 
 def builtin_profiles(machine: str | None = None) -> tuple[str, ...]:
-    """Names of the shipped profiles, of one machine or of all."""
+    """List the names of the shipped profiles, of one machine or of all."""
     names = _names("profiles")
     return tuple(n for n in names if machine is None or builtin_profile(n).machine == machine)
 
 
 def _names(kind: str) -> tuple[str, ...]:
+    """List the names of the shipped files of a kind, machines or profiles."""
     folder = resources.files("flexdt.twin") / "data" / kind
     return tuple(sorted(f.name[:-5] for f in folder.iterdir() if f.name.endswith(".toml")))
 
 
 def _data(kind: str, name: str) -> str:
+    """Read a shipped file; raise UnknownNameError if there is none."""
     if name not in _names(kind):
         what = f"no {kind[:-1]} called {name!r} ships with flexdt; there are"
         raise UnknownNameError.among(what, name, _names(kind))
@@ -804,8 +844,15 @@ def _data(kind: str, name: str) -> str:
 
 
 def _meshed(own: Raw, corners: Corners | None) -> Raw:
-    """Put the convex bodies of parts with meshes in place; what is wrong with a part is told by its
-    name."""
+    """Replace the meshes of components by their convex bodies.
+
+    Args:
+        own: content of a machine file; it is changed.
+        corners: reads the corners of a mesh file.
+
+    Raises:
+        UnknownNameError: names the component and what is wrong with it.
+    """
     parts = own.get("components", [])
     meshed = [p for p in parts if isinstance(p, dict) and "mesh" in p] if parts else []
     for part in meshed:
@@ -831,7 +878,7 @@ def _meshed(own: Raw, corners: Corners | None) -> Raw:
 
 
 def _inherited(own: Raw) -> Raw:
-    """A machine's content with that of its base."""
+    """Merge a machine's content into that of its base."""
     name, without = own.pop("base", None), own.pop("without", [])
     if name is None and not without:
         return own
@@ -853,7 +900,7 @@ def _inherited(own: Raw) -> Raw:
 
 
 def _drop(base: Raw, name: object) -> None:
-    """Take an axis or a component out of a machine's content, and out of all that names it."""
+    """Remove an axis or a component from a machine's content, and from all that names it."""
     parts: list[Raw] = base.get("components", [])
     axes = [base["axes"], base.get("virtual_axes", {})]
     known = [n for table in axes for n in table] + [c["name"] for c in parts]
@@ -883,7 +930,7 @@ def _drop(base: Raw, name: object) -> None:
 
 
 def _merged(base: Raw, own: Raw, whole: tuple[str, ...] = ("timing",)) -> Raw:
-    """`own` over `base`; tables in `whole` are replaced, others merged."""
+    """Merge `own` into `base`; tables in `whole` are replaced, others merged."""
     out = dict(base)
     for key, value in own.items():
         old = out.get(key)
@@ -898,8 +945,10 @@ def _merged(base: Raw, own: Raw, whole: tuple[str, ...] = ("timing",)) -> Raw:
 
 
 def _merged_parts(old: list[Raw], own: list[Raw]) -> list[Raw]:
-    """`own` over the parts of `old` that have their names; two of one name are both kept, so that
-    the check of names finds them."""
+    """Merge the components `own` into those of `old` by name.
+
+    Two components of one name are both kept, so that the check of names finds them.
+    """
     first = {part["name"]: part for part in reversed(own) if isinstance(part.get("name"), str)}
     known = [part["name"] for part in old]
     taken = [first[name] for name in known if name in first]
@@ -910,13 +959,24 @@ def _merged_parts(old: list[Raw], own: list[Raw]) -> list[Raw]:
 
 
 def _credit(merged: Raw, old: Raw, own: Raw) -> None:
-    """Say of an axis or component whose values are whose, where its own file does not."""
+    """Write into `source` which values come from this file and which from the base."""
     if own and isinstance(old.get("source"), str) and "source" not in own:
         said = ", ".join(key for key in own if key != "name")
         merged["source"] = f"{said}: this file; else {old['source'] or 'as the base has it'}"
 
 
 def _parse(model: type[_M], prepared: Callable[[Raw], Raw], text: str, file: str) -> _M:
+    """Parse and validate TOML, and collect all problems into one error.
+
+    Args:
+        model: type of the result.
+        prepared: converts the content before it is validated.
+        text: TOML.
+        file: name for error messages.
+
+    Raises:
+        MachineFileError: one line for each problem; data has file and problems.
+    """
     try:
         content = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
@@ -946,15 +1006,16 @@ def _parse(model: type[_M], prepared: Callable[[Raw], Raw], text: str, file: str
 
 
 def _limit(path: str) -> str:
-    """What docs/limits.md says of a key, to end an error with."""
+    """Return what docs/limits.md says of a key, to end an error with, or ""."""
     last = path.rpartition(".")[2].lower()
-    said = next((text for key, text in _LIMITS.items() if last.startswith(key)), None)
+    said = next((text for key, text in _KEY_LIMITS.items() if last.startswith(key)), None)
     return f"; {said} (docs/limits.md)" if said else ""
 
 
 def _require(
     names: Iterable[str], allowed: Iterable[str], where: str, what: str, more: str = ""
 ) -> None:
+    """Raise `_refused` unless all `names` are in `allowed`."""
     valid = list(allowed)
     for name in names:
         if name not in valid:

@@ -22,7 +22,7 @@ def fitted_text(
     axes: Collection[str],
     parse: Callable[[str, str], Machine] = parse_machine,
 ) -> str:
-    """The machine file `text` with the timing and some axes of `machine`, comments kept.
+    """Write the timing and some axes of `machine` into the machine file `text`, comments kept.
 
     Args:
         text: TOML of the machine that was fitted.
@@ -32,6 +32,9 @@ def fitted_text(
 
     Raises:
         MachineFileError: the file does not write its axes and times as tables.
+
+    Returns:
+        TOML.
     """
     blocks = {f"axes.{name}": _axis_table(name, machine.axes[name]) for name in axes}
     made = _replaced(text, {**blocks, "timing": _timing_table(machine.timing)})
@@ -42,7 +45,7 @@ def fitted_text(
 
 
 def _replaced(text: str, blocks: Mapping[str, str]) -> str:
-    """`text` with whole tables replaced; a comment stays unless it stands right before one."""
+    """Replace whole tables of `text`; a comment stays unless it is right before one."""
     left = dict(blocks)
     out: list[str] = []
     held: list[str] = []
@@ -70,10 +73,12 @@ def _replaced(text: str, blocks: Mapping[str, str]) -> str:
 
 
 def _axis_table(name: str, axis: Axis) -> str:
+    """Format an axis as a TOML table."""
     return "\n".join([f"[axes.{name}]", *_keys(axis)])
 
 
 def _timing_table(timing: Timing) -> str:
+    """Format times as TOML tables, with measured or assumed behind each."""
     lines = ["[timing]"]
     for line in _keys(timing, {"spread"}):
         kind = line.split("_s = ")[0]
@@ -89,6 +94,7 @@ def _timing_table(timing: Timing) -> str:
 
 
 def _keys(model: BaseModel, beside: set[str] | None = None) -> list[str]:
+    """Format a model's values that are not defaults as TOML lines."""
     values = model.model_dump(exclude_defaults=True, exclude=beside)
     return [
         f"{key} = {json.dumps(value, ensure_ascii=False)}"

@@ -30,7 +30,7 @@ from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine, Profile, unknown_axis
 from flexdt.twin.machine.travel import arrival, check_target
 
-_NAMES: Final = {
+_QUANTITY_NAMES: Final = {
     "object_y": "SOD",
     "detector_y": "SDD",
     "source_x": "source to the right",
@@ -43,6 +43,7 @@ _NAMES: Final = {
     "mount_x": "stage on the turntable, x",
     "mount_y": "stage on the turntable, y",
 }
+"""Quantity of a machine file -> name for tables."""
 
 
 def poses(
@@ -51,7 +52,7 @@ def poses(
     camera: CameraSettings,
     positions: Mapping[str, npt.ArrayLike],
 ) -> Poses:
-    """Nominal poses for motor positions within their travel; see `motor_poses`.
+    """Compute nominal poses for motor positions within their travel; see `motor_poses`.
 
     Raises:
         UnknownNameError: a motor the machine does not have.
@@ -69,7 +70,7 @@ def motor_poses(
     camera: CameraSettings,
     positions: Mapping[str, npt.ArrayLike],
 ) -> Poses:
-    """Nominal poses for motor positions as they were read, which no limit judges.
+    """Compute nominal poses for motor positions as they were read, without limits.
 
     Args:
         machine: whose motors these are.
@@ -91,13 +92,14 @@ def motor_poses(
     values = dict(zip(machine.axes, columns, strict=True))
 
     def total(quantity: str) -> FloatArray:
+        """Sum up a quantity over its motors, (n,) [mm, deg]."""
         out = np.full_like(columns[0], machine.fixed.get(quantity, 0.0))
         for motor, factor in machine.geometry.get(quantity, {}).items():
             out = out + factor * values[motor]
         return out
 
     def place(anchor: str, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> FloatArray:
-        """Where the motors put it, and what is added to that, (n, 3) [mm]."""
+        """Compute a place from the motors and `x`, `y`, `z` added to it, (n, 3) [mm]."""
         added = zip(COORDINATES, (x, y, z), strict=True)
         return np.stack([total(f"{anchor}_{c}") + more for c, more in added], axis=1)
 
@@ -123,7 +125,7 @@ def motor_poses(
 
 
 def virtual_reading(machine: Machine, name: str, positions: Mapping[str, float]) -> float:
-    """Reading of virtual axis `name` [mm] for motor positions."""
+    """Compute the reading of virtual axis `name` [mm] for motor positions."""
     virtual = machine.virtual_axes[name]
     return virtual.constant + virtual.factor * positions[virtual.of]
 
@@ -135,7 +137,9 @@ def resolve_targets(
     *,
     relative: bool = False,
 ) -> dict[str, float]:
-    """Targets of motors and virtual axes to absolute motor targets within their travel.
+    """Resolve targets of motors and virtual axes to motor targets within their travel.
+
+    `twin/machine/travel.py` has the rule for targets beyond a limit.
 
     `twin/machine/travel.py` has the rule for what lies beyond a limit.
 
@@ -173,7 +177,17 @@ def motor_targets(
     *,
     relative: bool = False,
 ) -> dict[str, float]:
-    """Motor -> target of a move of `axis`, without limits; arguments as `resolve_targets`.
+    """Compute the motor targets of a move of `axis`, limits ignored.
+
+    Args:
+        machine: whose axes these are.
+        axis: motor or virtual axis.
+        value: absolute target [mm, deg], or a displacement when `relative`.
+        positions: of the motors.
+        relative: read `value` as a displacement.
+
+    Returns:
+        Motor -> target [mm, deg].
 
     Raises:
         UnknownNameError: no such axis.
@@ -194,7 +208,7 @@ def _too_far(
     *,
     relative: bool,
 ) -> LimitError:
-    """A motor's error, in the words of the axis that was to move."""
+    """Convert a motor's limit error to one of the axis that was to move."""
     if axis in machine.axes:
         return error
     here, ends = virtual_reading(machine, axis, positions), []
@@ -229,7 +243,7 @@ class Place:
 
 
 def places(machine: Machine) -> list[Place]:
-    """SOD, SDD and what else motors move or the file fixes.
+    """List SOD, SDD and the other quantities that motors move or the file fixes.
 
     Example:
         >>> from flexdt.twin.machine.description import builtin_machine
@@ -238,13 +252,13 @@ def places(machine: Machine) -> list[Place]:
     """
     return [
         place(machine, quantity)
-        for quantity in _NAMES
+        for quantity in _QUANTITY_NAMES
         if machine.geometry.get(quantity) or quantity in (*machine.fixed, "object_y", "detector_y")
     ]
 
 
 def place(machine: Machine, quantity: str) -> Place:
-    """One of them by its name in the machine file."""
+    """Describe one quantity by its name in the machine file."""
     fixed = machine.fixed.get(quantity, 0.0) + (
         machine.sample_height_mm if quantity == "object_z" else 0.0
     )
@@ -258,4 +272,4 @@ def place(machine: Machine, quantity: str) -> Place:
         times = "" if abs(factor) == 1.0 else f"{abs(factor):g} "
         sign = "- " if factor < 0 else "+ " if words else ""
         words.append(f"{sign}{times}{motor}")
-    return Place(_NAMES[quantity], " ".join(words) or "0", ends[0], ends[1], home)
+    return Place(_QUANTITY_NAMES[quantity], " ".join(words) or "0", ends[0], ends[1], home)

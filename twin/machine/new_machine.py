@@ -10,15 +10,16 @@ from flexdt.twin.errors import LimitError
 from flexdt.twin.machine.description import Machine, parse_machine
 from flexdt.twin.machine.fitted_machine import Range
 
-_BESIDE_MM = 60.0
-"""How much larger a panel's housing is than what it sees (assumed)."""
+_HOUSING_MARGIN_MM = 60.0
+"""Width that a panel's housing adds to its active area [mm] (assumed)."""
 _RAIL_AXIS = "D"
-_RAIL: dict[str, object] = {
+"""Name of the motor of a panel for which the base has none."""
+_RAIL_VALUES: dict[str, object] = {
     "speed": 30.0, "max_speed": 50.0, "acceleration": 50.0, "max_acceleration": 100.0,
     "description": "panel away from the source (+); it is the SDD",
     "source": "assumed but for its travel",
 }  # fmt: skip
-"""The motor of a panel for which the base has none."""
+"""Values of that motor."""
 
 
 @dataclass(frozen=True)
@@ -56,13 +57,14 @@ class Answers:
 
 
 def new_machine_text(answers: Answers) -> str:
-    """The text of a machine file (TOML).
+    """Write a machine file (TOML) from answers.
 
     Raises:
         UnknownNameError: no such base, or it has no such axis.
-        LimitError: a range of SOD for a base without a motor along it; SOD or SDD and the travel
-            of its motor.
-        MachineFileError: the answers do not make a machine; key, value and what is allowed.
+        LimitError: a range of SOD for a base without a motor along it; SOD or SDD and the
+            travel of its motor.
+        MachineFileError: the answers do not make a machine; key, value and what is
+            allowed.
 
     Example:
         >>> text = new_machine_text(Answers("lab", "micro_ct", sod_mm=(80.0, 80.0), max_kV=90.0))
@@ -98,7 +100,7 @@ def new_machine_text(answers: Answers) -> str:
             # A cabinet whose panel runs on a rail: what stood fixed is a motor's reading now.
             fixed[quantity] = 0.0
             home = min(max(base.fixed.get(quantity, 0.0), distance[0]), distance[1])
-            rail = {"lower": distance[0], "upper": distance[1], "home": home, **_RAIL}
+            rail = {"lower": distance[0], "upper": distance[1], "home": home, **_RAIL_VALUES}
         else:
             raise LimitError(
                 f"{answers.base} has no motor along the {what}, so it is one number; for a range "
@@ -142,7 +144,7 @@ def new_machine_text(answers: Answers) -> str:
         part: dict[str, object] = {"name": panel.name, "axis": _RAIL_AXIS if rail else None}
         across, up = base.detector.model_copy(update=seen).pixels.size_mm
         if (across, up) != base.detector.pixels.size_mm:
-            sides = (across + _BESIDE_MM, panel.size_mm[1], up + _BESIDE_MM)
+            sides = (across + _HOUSING_MARGIN_MM, panel.size_mm[1], up + _HOUSING_MARGIN_MM)
             part |= {"size_mm": [round(side, 1) for side in sides], "source": "assumed"}
         text += f"\n[[components]]\n{_lines(part)}"
     parse_machine(text, "the new machine")
@@ -150,6 +152,7 @@ def new_machine_text(answers: Answers) -> str:
 
 
 def _detector(answers: Answers, base: Machine) -> dict[str, object]:
+    """Collect the values of `[detector]`; None for those that stay."""
     pitch, own = answers.pitch_mm, base.detector
     out: dict[str, object] = {
         "columns": answers.columns,
@@ -165,6 +168,7 @@ def _detector(answers: Answers, base: Machine) -> dict[str, object]:
 
 
 def _lines(values: Mapping[str, object]) -> str:
+    """Format values that are not None as TOML lines."""
     return "".join(
         f"{key} = {json.dumps(value, ensure_ascii=False)}\n".replace("\x7f", "\\u007f")
         for key, value in values.items()

@@ -18,19 +18,26 @@ from typing import Final, Literal
 from flexdt.twin.errors import LimitError
 from flexdt.twin.machine.description import Machine
 
-SAME_PLACE: Final = 1e-9
-"""Difference between two positions that is rounding [mm, deg]."""
+POSITION_ROUNDING: Final = 1e-9
+"""Largest difference between two positions that counts as rounding [mm, deg]."""
 Rate = Literal["speed", "acceleration"]
 
 
 @dataclass(frozen=True)
 class Arrival:
-    """Where motors arrive that are sent to targets, or the rates that they get.
+    """Motor targets, or rates, after the rule for limits.
+
+    Attributes:
+        motors: motor -> target within its travel [mm, deg], or rate.
+        told: messages about what is beyond a limit by more than rounding.
+        beyond: error for one that is beyond by more than the tolerance; None: there is
+            none.
 
     Attributes:
         motors: motor -> target within its travel [mm, deg], or rate.
         told: what lies beyond a limit by more than rounding, in words.
-        beyond: one that lies beyond by more than the tolerance, as an error; None: there is none.
+        beyond: one that lies beyond by more than the tolerance, as an error; None: there
+            is none.
     """
 
     motors: Mapping[str, float]
@@ -38,12 +45,12 @@ class Arrival:
     beyond: LimitError | None = None
 
     def is_clamped(self, machine: Machine) -> bool:
-        """Whether a script's line goes on with `motors`; otherwise it is an error."""
+        """Return whether a script's line continues with `motors`; otherwise it is an error."""
         return self.beyond is None or machine.on_limit == "clamp"
 
 
 def arrival(machine: Machine, axis: str, targets: Mapping[str, float]) -> Arrival:
-    """The rule for a move of `axis`.
+    """Apply the rule to the targets of a move of `axis`.
 
     Args:
         machine: whose motors these are.
@@ -53,22 +60,30 @@ def arrival(machine: Machine, axis: str, targets: Mapping[str, float]) -> Arriva
     told, beyond = [], None
     for motor, target in targets.items():
         left = _distance_beyond(machine, motor, target)
-        if left <= SAME_PLACE:
+        if left <= POSITION_ROUNDING:
             continue
         error = _outside(machine, motor, target)
         told.append(error.message)
-        if not left <= machine.axes[motor].arrival_tolerance + SAME_PLACE:
+        if not left <= machine.axes[motor].arrival_tolerance + POSITION_ROUNDING:
             beyond = beyond or error
     return Arrival(clamp(machine, targets, axis), tuple(told), beyond)
 
 
 def rate(machine: Machine, axis: str, what: Rate, value: float) -> Arrival:
-    """The rule for a speed or acceleration of `axis`, above the most that its motors have."""
+    """Apply the rule to a speed or acceleration of `axis` that may be above its motors'
+    maximum.
+
+    Args:
+        machine: whose motors these are.
+        axis: motor or virtual axis.
+        what: speed or acceleration.
+        value: of the axis [mm or deg, per s or s2].
+    """
     motors, told, beyond = {}, [], None
     for motor, share in machine.moves(axis).items():
         a = machine.axes[motor]
         asked, most = value * abs(share), a.max_speed if what == "speed" else a.max_acceleration
-        if not asked <= most * (1.0 + SAME_PLACE):  # as one that is no number
+        if not asked <= most * (1.0 + POSITION_ROUNDING):  # as one that is no number
             unit = f"{a.unit}/{'s' if what == 'speed' else 's2'}"
             told.append(f"{motor} {what} {asked:g} {unit} is above {most:g} {unit}")
             beyond = beyond or LimitError.of_axis(told[-1], motor, asked, most, unit)
@@ -77,20 +92,22 @@ def rate(machine: Machine, axis: str, what: Rate, value: float) -> Arrival:
 
 
 def check_target(machine: Machine, axis: str, value: float) -> float:
-    """Return `value` if it lies within the travel of motor `axis`; what is beyond by rounding alone
-    is the limit.
+    """Check that `value` is within the travel of motor `axis`.
+
+    Returns:
+        The value; the limit, if it is beyond that by rounding alone.
 
     Raises:
         LimitError: says axis, value, unit and limits.
     """
     a = machine.axis(axis)
-    if not _distance_beyond(machine, axis, value) <= SAME_PLACE:
+    if not _distance_beyond(machine, axis, value) <= POSITION_ROUNDING:
         raise _outside(machine, axis, value)
     return min(max(value, a.lower), a.upper)
 
 
 def clamp(machine: Machine, targets: Mapping[str, float], axis: str) -> dict[str, float]:
-    """The targets moved into the travel; motors of a virtual axis give up the same share."""
+    """Move the targets into the travel; motors of a virtual axis give up the same share."""
     bounded = _bounded(machine, targets)
     if axis in machine.axes or bounded == targets:
         return bounded
@@ -100,17 +117,19 @@ def clamp(machine: Machine, targets: Mapping[str, float], axis: str) -> dict[str
 
 
 def _bounded(machine: Machine, targets: Mapping[str, float]) -> dict[str, float]:
+    """Move each target into its motor's travel."""
     axes = machine.axes
     return {m: min(max(t, axes[m].lower), axes[m].upper) for m, t in targets.items()}
 
 
 def _distance_beyond(machine: Machine, motor: str, target: float) -> float:
-    """How far a target lies beyond the travel [mm, deg]; negative within it."""
+    """Compute how far a target is beyond the travel [mm, deg]; negative within it."""
     a = machine.axes[motor]
     return max(a.lower - target, target - a.upper)
 
 
 def _outside(machine: Machine, motor: str, target: float) -> LimitError:
+    """Make the error for a target outside the travel."""
     a = machine.axes[motor]
     said = f"{motor} target {target:g} {a.unit} is outside [{a.lower:g}, {a.upper:g}] {a.unit}"
     return LimitError.of_axis(said, motor, target, [a.lower, a.upper], a.unit)

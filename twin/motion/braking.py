@@ -13,28 +13,31 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 from flexdt.twin.machine.description import Machine
-from flexdt.twin.machine.travel import SAME_PLACE
+from flexdt.twin.machine.travel import POSITION_ROUNDING
 from flexdt.twin.motion import profiles as motion
 from flexdt.twin.motion.drives import Drive, Drives
-from flexdt.twin.motion.profiles import ROUNDING, Piece, Trajectory
+from flexdt.twin.motion.profiles import TIME_ROUNDING_S, Piece, Trajectory
 
-PATH_ERROR = 1e-5
-"""How far the pieces of constant acceleration may stray from the path that is slowed [mm, deg].
+PATH_TOLERANCE = 1e-5
+"""Largest distance of the pieces of constant acceleration from the slowed path [mm, deg].
 
-A thousandth of the tolerance of a sweep, so that what was swept stays certified."""
-AT_REST = 1e-9
-"""Programme time that passes at less than this rate stands still."""
-STILL = 1e-6
-"""A velocity that is rounding [mm/s, deg/s]."""
-LEAST_S = 1e-7
-"""Programme time is not cut finer than this [s]."""
-SHORT_S = 1e-4
-"""Over less than this one piece of constant acceleration strays by less than rounding [s]."""
-IN_STEP = 1e-9
-"""Relative difference of two velocities that is rounding: such motors run in step."""
+A thousandth of the tolerance of a sweep, so that what was swept stays certified.
+
+A thousandth of the tolerance of a sweep, so that what was swept stays certified.
+"""
+MIN_TIME_RATE = 1e-9
+"""Rate of programme time below which it stands still."""
+VELOCITY_ROUNDING = 1e-6
+"""Velocity that counts as rounding [mm/s, deg/s]."""
+MIN_CELL_S = 1e-7
+"""Shortest piece of programme time [s]."""
+MAX_SINGLE_PIECE_S = 1e-4
+"""Duration over which one piece of constant acceleration strays by less than rounding [s]."""
+STEP_TOLERANCE = 1e-9
+"""Relative difference of two velocities below which the motors run in step."""
 
 Most = Mapping[str, float] | None
-"""Motor -> acceleration that braking may use; None: what the motion in force was planned with."""
+"""Motor -> acceleration that braking may use; None: that of the motion in force."""
 
 
 @dataclass(frozen=True)
@@ -57,16 +60,16 @@ class _Cell:
 
     @property
     def advance(self) -> float:
-        """Programme seconds that it covers."""
+        """Programme time that the cell covers [s]."""
         return self.length * (self.rate - 0.5 * self.slowing * self.length)
 
 
 def braked_along(drives: Drives, now: float, most: Most = None) -> dict[str, Trajectory]:
-    """Trajectories that slow everything under way to rest on the path it is on.
+    """Slow everything under way to rest on the path it is on.
 
-    The motors keep their common path and pass it ever more slowly. While a motor brakes with all
-    it may use, the programme's time cannot slow, so that this may take longer than stopping each
-    motor by itself.
+    The motors keep their common path and pass it ever more slowly. While a motor brakes
+    with all it may use, the programme's time cannot slow, so that this may take longer
+    than stopping each motor by itself.
 
     Args:
         drives: every motor with all that it is to follow.
@@ -74,8 +77,9 @@ def braked_along(drives: Drives, now: float, most: Most = None) -> dict[str, Tra
         most: motor -> greatest acceleration, not below the one in force [mm/s2, deg/s2].
 
     Returns:
-        Motor -> trajectory, of those that had anything left to do. Positions stray from the path
-        by at most `PATH_ERROR`.
+        Motor -> trajectory, of those that had anything left to do. Positions stray from
+        the path
+        by at most `PATH_TOLERANCE`.
     """
     due = {name: drive for name, drive in drives.items() if drive.end > now}
     cells = _cells(due, now, most)
@@ -85,7 +89,7 @@ def braked_along(drives: Drives, now: float, most: Most = None) -> dict[str, Tra
 def braked_apart(
     machine: Machine, drives: Drives, now: float, most: Most = None
 ) -> dict[str, Trajectory]:
-    """Trajectories that stop every motor as soon as it can; motors of one virtual axis in step.
+    """Stop every motor as soon as it can; motors of one virtual axis stay in step.
 
     Args:
         machine: says which motors belong together.
@@ -114,7 +118,7 @@ def braked_apart(
                 rest = motion.stop(current.position(now), velocity[name], acceleration, now)
             # It was braking anyway: where it was bound is where it ends, exactly (and not a
             # rounding error beyond its limit).
-            near = abs(rest.target - current.target) < SAME_PLACE
+            near = abs(rest.target - current.target) < POSITION_ROUNDING
             out[name] = replace(rest, target=current.target) if near else rest
     return out
 
@@ -122,13 +126,16 @@ def braked_apart(
 def coasting(
     machine: Machine, drives: Drives, now: float, decelerations: Mapping[str, float]
 ) -> dict[str, Trajectory]:
-    """Trajectories of motors without power: each slows by friction, or ends at its hard stop.
+    """Compute motion without power: each motor slows by friction, or ends at its hard stop.
 
     Args:
         machine: travel limits.
         drives: every motor with all that it is to follow.
         now: when power is cut [s].
         decelerations: motor -> by how much it slows [mm/s2, deg/s2].
+
+    Returns:
+        Motor -> trajectory, of those that are under way.
     """
     out = {}
     for name, drive in drives.items():
@@ -147,7 +154,7 @@ def coasting(
 
 
 def programme_time_at_rest(drives: Drives, at: float, most: Most) -> float:
-    """The programme's own time [s] at which a stop along its path, begun at `at`, has ended."""
+    """Compute the programme time [s] at which a stop along the path, begun at `at`, ends."""
     due = {name: drive for name, drive in drives.items() if drive.end > at}
     cells = _cells(due, at, most)
     return cells[-1].programme + cells[-1].advance if cells else at
@@ -156,7 +163,7 @@ def programme_time_at_rest(drives: Drives, at: float, most: Most) -> float:
 def braked_at(
     drives: Drives, at: float, trajectories: Mapping[str, Trajectory], most: Most
 ) -> dict[str, Drive]:
-    """`drives` that follow `trajectories`, and are braked along their path from `at` on."""
+    """Make `drives` follow `trajectories` and brake along their path from `at` on."""
     following = {**drives, **{n: drives[n].following(t) for n, t in trajectories.items()}}
     braked = braked_along(following, at, most)
     return {
@@ -168,32 +175,42 @@ def braked_at(
 
 
 def _coupled(machine: Machine, velocity: Mapping[str, float]) -> Iterable[list[str]]:
-    """Motors of a virtual axis that run in step now, so that they have to stop in step."""
+    """Yield the motors of each virtual axis that run in step now and must stop in step."""
     for virtual in machine.virtual_axes.values():
         rates = [velocity.get(name, 0.0) / share for name, share in virtual.moves.items()]
         fastest = max(map(abs, rates))
-        if fastest > 0.0 and max(rates) - min(rates) <= IN_STEP * fastest:
+        if fastest > 0.0 and max(rates) - min(rates) <= STEP_TOLERANCE * fastest:
             yield list(virtual.moves)
 
 
 def greatest(name: str, leg: Trajectory, time: float, most: Most) -> float:
-    """The acceleration that a motor may brake with while it follows `leg` [mm/s2, deg/s2]."""
+    """Return the acceleration that a motor may brake with while it follows `leg` [mm/s2,
+    deg/s2]."""
     planned = leg.acceleration(time)
     return planned if most is None else max(planned, most[name])
 
 
 def _cells(drives: Drives, now: float, most: Most) -> list[_Cell]:
-    """The law of programme time that brings all motors to rest soonest, within the limits."""
+    """Compute the law of programme time that brings all motors to rest soonest, within limits.
+
+    Args:
+        drives: motors that are under way.
+        now: start of braking [s].
+        most: accelerations that braking may use.
+
+    Returns:
+        Cells that join up, until the rate is zero.
+    """
     cells: list[_Cell] = []
     s, rate, time = now, 1.0, now
     while rate > 0.0 and drives:
         states = [_state(name, drive, s, most) for name, drive in drives.items()]
-        if max(abs(state.velocity) for state in states) < STILL:
+        if max(abs(state.velocity) for state in states) < VELOCITY_ROUNDING:
             break
         until = min(state.until for state in states)
         ahead = until - s
-        if ahead <= ROUNDING:  # a knot that rounding has put a hair ahead
-            step = max(ROUNDING, 4.0 * math.ulp(s))
+        if ahead <= TIME_ROUNDING_S:  # a knot that rounding has put a hair ahead
+            step = max(TIME_ROUNDING_S, 4.0 * math.ulp(s))
             s, time = s + step, time + step
             continue
         roughly = min(state.slowing(rate, 0.0) for state in states)
@@ -201,12 +218,12 @@ def _cells(drives: Drives, now: float, most: Most) -> list[_Cell]:
         # it strays by 3 |a| rate slowing length^3 / 324.
         jerk = max(3.0 * abs(state.acceleration) * rate * roughly for state in states)
         if jerk > 0.0:
-            longest = min((324.0 * PATH_ERROR / jerk) ** (1.0 / 3.0), rate / roughly)
+            longest = min((324.0 * PATH_TOLERANCE / jerk) ** (1.0 / 3.0), rate / roughly)
             shorter = longest * (rate - 0.5 * roughly * longest)
-            ahead = min(ahead, max(shorter, LEAST_S))
+            ahead = min(ahead, max(shorter, MIN_CELL_S))
         slowing = min(state.slowing(rate, ahead) for state in states)
         left = rate * rate - 2.0 * slowing * ahead
-        ends = left < AT_REST * AT_REST
+        ends = left < MIN_TIME_RATE * MIN_TIME_RATE
         following = 0.0 if ends else math.sqrt(left)
         length = rate / slowing if ends else 2.0 * ahead / (rate + following)
         cell = _Cell(time, s, rate, slowing, length)
@@ -226,7 +243,8 @@ class _State:
     until: float
 
     def slowing(self, rate: float, ahead: float) -> float:
-        """How much programme time may slow over the next `ahead` programme seconds [1/s]."""
+        """Compute how much programme time may slow over the next `ahead` programme
+        seconds [1/s]."""
         speed, a = abs(self.velocity), abs(self.acceleration)
         if self.velocity * self.acceleration < 0.0:  # it brakes: both are greatest at the start
             return max(0.0, self.most - a * rate * rate) / speed
@@ -240,6 +258,7 @@ class _State:
 
 
 def _state(name: str, drive: Drive, s: float, most: Most) -> _State:
+    """Evaluate a motor at programme time `s`."""
     leg = drive.at(s)
     velocity, acceleration, until = leg.law(s)
     return _State(
@@ -248,7 +267,7 @@ def _state(name: str, drive: Drive, s: float, most: Most) -> _State:
 
 
 def _along(drive: Drive, cells: list[_Cell], now: float) -> Trajectory:
-    """One motor's way through the cells."""
+    """Convert the cells to one motor's trajectory."""
     pieces: list[Piece] = []
     end, target = now, drive.at(now).position(now)
     for cell in cells:
@@ -269,7 +288,7 @@ def _along(drive: Drive, cells: list[_Cell], now: float) -> Trajectory:
         if cell.slowing == 0.0 or acceleration == 0.0:
             rate = acceleration * cell.rate**2 - velocity * cell.slowing
             pieces.append(Piece(cell.start, x, v, rate))
-        elif cell.length < SHORT_S:
+        elif cell.length < MAX_SINGLE_PIECE_S:
             pieces.append(Piece(cell.start, x, v, (arrives - v) / cell.length))
         else:
             # Two halves of constant acceleration that meet position and velocity at both ends.
@@ -288,4 +307,6 @@ def _along(drive: Drive, cells: list[_Cell], now: float) -> Trajectory:
     if not pieces or end == now:
         return motion.at_rest(target, now)
     final = drive.at(now).target
-    return Trajectory(tuple(pieces), end, final if abs(target - final) < SAME_PLACE else target)
+    return Trajectory(
+        tuple(pieces), end, final if abs(target - final) < POSITION_ROUNDING else target
+    )

@@ -20,7 +20,7 @@ from flexdt.twin.machine.description import Axis, Machine
 from flexdt.twin.machine.kinematics import resolve_targets
 from flexdt.twin.machine.travel import Rate, rate
 from flexdt.twin.motion import profiles as motion
-from flexdt.twin.motion.profiles import LEAST_RATE, Trajectory
+from flexdt.twin.motion.profiles import MIN_RATE, Trajectory
 
 
 @dataclass(frozen=True)
@@ -44,14 +44,16 @@ class Drive:
 
     @cached_property
     def _starts(self) -> tuple[float, ...]:
+        """Starts of the trajectories on the clock of `now` [s]."""
         # Rounded as `shifted` rounds: where one leg ends in motion, the next one has begun.
         return tuple(t.start + self.origin for t in self.trajectories)
 
     def _index(self, now: float) -> int:
+        """Return the index of the trajectory in force at `now`."""
         return max(0, bisect_right(self._starts, now) - 1)
 
     def at(self, now: float) -> Trajectory:
-        """The trajectory in force at `now` [s]."""
+        """Return the trajectory in force at `now` [s]."""
         index = self._index(now)
         if not self.origin:
             return self.trajectories[index]
@@ -64,33 +66,34 @@ class Drive:
 
     @cached_property
     def _latest(self) -> dict[int, Trajectory]:
-        """The leg that was asked for last, by its index, on the clock of `now`."""
+        """The leg requested last, by its index, on the clock of `now`."""
         return {}
 
     def next_start(self, now: float) -> float:
-        """When the trajectory after the one in force begins [s]; inf if there is none."""
+        """Return the start of the trajectory after the one in force [s]; inf if there is
+        none."""
         index = self._index(now) + 1
         return self._starts[index] if index < len(self._starts) else math.inf
 
     @property
     def end(self) -> float:
-        """When the motor comes to its last rest [s]."""
+        """Moment at which the motor comes to its last rest [s]."""
         return self.trajectories[-1].end + self.origin
 
     @property
     def final(self) -> float:
-        """Where it comes to its last rest [mm, deg]."""
+        """Position at which it comes to its last rest [mm, deg]."""
         return self.trajectories[-1].target
 
     def ahead(self, now: float) -> Trajectory:
-        """All that it is to follow from `now` on, as one trajectory."""
+        """Join all trajectories from `now` on into one."""
         left = self.trajectories[self._index(now) :]
         if self.origin:
             left = tuple(leg.shifted(self.origin) for leg in left)
         return left[0] if len(left) == 1 else motion.joined(left)
 
     def following(self, *trajectories: Trajectory, origin: float = 0.0) -> Drive:
-        """The same motor on `trajectories` alone."""
+        """Make the same motor follow `trajectories` alone."""
         return replace(self, trajectories=trajectories, origin=origin)
 
 
@@ -98,7 +101,7 @@ Drives = Mapping[str, Drive]
 
 
 def home(machine: Machine, now: float) -> dict[str, Drive]:
-    """Every motor at rest at its home position, with the machine's speed and acceleration."""
+    """Make drives at rest at home, with the machine's speeds and accelerations."""
     return {
         name: Drive(a.speed, a.acceleration, (motion.at_rest(a.home, now),))
         for name, a in machine.axes.items()
@@ -114,7 +117,7 @@ def plan_move(
     relative: bool = False,
     shortest: bool = False,
 ) -> dict[str, Trajectory]:
-    """Trajectories of the motors that `targets` moves; all begin now.
+    """Plan the motion of the motors that `targets` moves; all begin now.
 
     Args:
         machine: whose motors these are.
@@ -122,11 +125,15 @@ def plan_move(
         targets: axis (motor or virtual) -> position [mm, deg].
         now: time of the command [s].
         relative: targets are displacements from where the motors are bound for.
-        shortest: rotations go the shorter way round to an equivalent angle (thesis 4.5.2).
+        shortest: rotations go the shorter way round to an equivalent angle (thesis
+            4.5.2).
 
     Raises:
         UnknownNameError: no such axis.
         LimitError: a target outside its travel, or one motor asked twice.
+
+    Returns:
+        Motor -> trajectory.
     """
     bound = {name: d.at(now).target for name, d in drives.items()}
     _refuse_double(machine, targets)
@@ -149,7 +156,7 @@ def plan_move(
 def plan_jog(
     machine: Machine, drives: Drives, axis: str, velocity: float, lease_s: float, now: float
 ) -> dict[str, Trajectory]:
-    """Trajectories of a jog: run until the lease ends, brake; brake in time for a travel limit.
+    """Plan a jog: run until the lease ends, brake; brake in time for a travel limit.
 
     Args:
         machine: whose motors these are.
@@ -162,6 +169,9 @@ def plan_jog(
     Raises:
         UnknownNameError: no such axis.
         LimitError: faster than the motor allows, or not a finite number.
+
+    Returns:
+        Motor -> trajectory.
     """
     moves = machine.moves(axis)
     if not (math.isfinite(lease_s) and lease_s > 0):
@@ -175,7 +185,7 @@ def plan_jog(
         raise LimitError.of_axis(said, axis, str(velocity), limit, f"{unit}/s")
 
     def run(name: str, lease: float) -> Trajectory:
-        """A motor's share: it runs for `lease` [s], or as far as its limit."""
+        """Plan a motor's share: it runs for `lease` [s], or as far as its limit."""
         axis, current = machine.axes[name], drives[name].at(now)
         wanted = velocity * moves[name]
         acceleration = max(pace[name][1], current.acceleration(now))
@@ -202,11 +212,21 @@ def with_settings(
     speed: float | None = None,
     acceleration: float | None = None,
 ) -> dict[str, Drive]:
-    """Drives with other settings for the motors of `axis`; they hold from the next motion on.
+    """Change speed and acceleration of the motors of `axis` for motions to come.
 
     Raises:
         UnknownNameError: no such axis.
         LimitError: not within (0, maximum].
+
+    Args:
+        machine: whose motors these are.
+        drives: every motor.
+        axis: motor or virtual axis.
+        speed: [mm/s, deg/s] of the axis; None keeps it.
+        acceleration: [mm/s2, deg/s2] of the axis; None keeps it.
+
+    Returns:
+        All drives, changed ones replaced.
     """
     out = dict(drives)
     shares = {name: abs(factor) for name, factor in machine.moves(axis).items()}
@@ -217,9 +237,9 @@ def with_settings(
         if value is None:
             continue
         above = rate(machine, axis, what, value).told
-        if not above and all(value * share >= LEAST_RATE for share in shares.values()):
+        if not above and all(value * share >= MIN_RATE for share in shares.values()):
             continue
-        low = LEAST_RATE / min(shares.values())
+        low = MIN_RATE / min(shares.values())
         axes = machine.axes
         high = min(getattr(axes[name], f"max_{what}") / share for name, share in shares.items())
         raise LimitError(
@@ -241,6 +261,7 @@ def with_settings(
 
 
 def _refuse_double(machine: Machine, targets: Mapping[str, float]) -> None:
+    """Raise LimitError if two targets move the same motor."""
     seen: dict[str, str] = {}
     for name in targets:
         for motor in machine.moves(name):
@@ -253,7 +274,7 @@ def _refuse_double(machine: Machine, targets: Mapping[str, float]) -> None:
 def _paces(
     machine: Machine, drives: Drives, targets: Mapping[str, float]
 ) -> dict[str, tuple[float, float]]:
-    """Speed and acceleration of every motor; those of one axis run in step."""
+    """Compute motor -> (speed, acceleration); motors of one axis run in step."""
     out: dict[str, tuple[float, float]] = {}
     for name in targets:
         moves = {m: abs(f) for m, f in machine.moves(name).items()}
@@ -264,7 +285,7 @@ def _paces(
 
 
 def _shortest(axis: Axis, position: float, target: float) -> float:
-    """The angle equivalent to `target` that is nearest to `position` and within travel."""
+    """Find the angle equivalent to `target` nearest to `position` and within travel."""
     if axis.kind != "rotation":
         return target
     turns = round((position - target) / 360.0)

@@ -22,12 +22,12 @@ import numpy.typing as npt
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.values import ArrayValue
 
-LEAST_RATE = 1e-6
+MIN_RATE = 1e-6
 """Least speed and acceleration that can be set: a move may be slow, but it ends."""
 
 
-ROUNDING = 1e-9
-"""Times that differ by less are equal [s]."""
+TIME_ROUNDING_S = 1e-9
+"""Largest difference between two times that counts as rounding [s]."""
 
 
 @dataclass(frozen=True)
@@ -73,13 +73,13 @@ class Trajectory:
         return tuple(times)
 
     def _piece(self, time: float) -> Piece | None:
-        """The piece in force, or None when at rest (before the start or after the end)."""
+        """Return the piece in force, or None at rest (before the start or after the end)."""
         if time >= self.end or time < self.start:
             return None
         return self.pieces[bisect_right(self.knots, time, hi=len(self.pieces)) - 1]
 
     def position(self, time: float) -> float:
-        """Position at `time` [s]."""
+        """Compute the position at `time` [s]."""
         piece = self._piece(time)
         if piece is None:
             return self.target if time >= self.end else self.pieces[0].position
@@ -87,22 +87,22 @@ class Trajectory:
         return piece.position + dt * (piece.velocity + 0.5 * piece.acceleration * dt)
 
     def velocity(self, time: float) -> float:
-        """Velocity at `time` [s]."""
+        """Compute the velocity at `time` [s]."""
         piece = self._piece(time)
         if piece is None:
             return 0.0
         return piece.velocity + piece.acceleration * (time - piece.start)
 
     def moving(self, time: float) -> bool:
-        """Whether the motor is still under way at `time`."""
+        """Return whether the motor is under way at `time`."""
         return self.start <= time < self.end
 
     def positions(self, times: npt.ArrayLike) -> FloatArray:
-        """Positions at many times [s], same shape as `times`."""
+        """Compute positions at many times [s], of the same shape as `times`."""
         return AxisPath.along(self).positions(times)
 
     def law(self, time: float) -> tuple[float, float, float]:
-        """Velocity, acceleration, and the time until which the motor obeys them [s].
+        """Return velocity, acceleration, and the time until which the motor obeys them [s].
 
         It also ends where the motor turns round; inf for a motor that rests for good.
         """
@@ -116,13 +116,13 @@ class Trajectory:
         velocity, a = piece.velocity + piece.acceleration * (time - piece.start), piece.acceleration
         if velocity * a < 0.0:
             turns = -velocity / a
-            if turns <= ROUNDING:
+            if turns <= TIME_ROUNDING_S:
                 return 0.0, a, until
             until = min(until, time + turns)
         return velocity, a, until
 
     def acceleration(self, time: float) -> float:
-        """Largest acceleration still to come after `time`, >= 0: what braking was planned with."""
+        """Return the largest acceleration after `time`, >= 0: what braking was planned with."""
         if time >= self.end:
             return 0.0
         return max(
@@ -145,18 +145,18 @@ class Trajectory:
     def redirected(
         self, target: float, speed: float, acceleration: float, time: float
     ) -> Trajectory:
-        """The motion to rest at `target` from what this one does at `time`, as `move` plans it."""
+        """Plan the motion to rest at `target` from the state at `time`; see `move`."""
         return move(self.position(time), self.velocity(time), target, speed, acceleration, time)
 
     def shifted(self, dt: float) -> Trajectory:
-        """The same motion `dt` seconds later."""
+        """Return the same motion `dt` seconds later."""
         pieces = tuple(
             Piece(p.start + dt, p.position, p.velocity, p.acceleration) for p in self.pieces
         )
         return Trajectory(pieces, self.end + dt, self.target)
 
     def time_at(self, position: float) -> float | None:
-        """First time at which the motor passes `position`, or None if it never does."""
+        """Find the first time at which the motor passes `position`, or None."""
         for i, piece in enumerate(self.pieces):
             stop = self.pieces[i + 1].start if i + 1 < len(self.pieces) else self.end
             dt = _first_root(0.5 * piece.acceleration, piece.velocity, piece.position - position)
@@ -190,7 +190,7 @@ class AxisPath(ArrayValue):
 
     @classmethod
     def along(cls, trajectory: Trajectory) -> AxisPath:
-        """One trajectory, with the rest after it."""
+        """Convert one trajectory, with the rest after it."""
         rows = [(p.start, p.position, p.velocity, p.acceleration) for p in trajectory.pieces]
         if math.isfinite(trajectory.end):
             rows.append((trajectory.end, trajectory.target, 0.0, 0.0))
@@ -198,28 +198,29 @@ class AxisPath(ArrayValue):
 
     @classmethod
     def standing(cls, position: float) -> AxisPath:
-        """A motor that does not move."""
+        """Make the path of a motor that does not move."""
         zero = np.zeros(1)
         return cls(zero, np.array([position]), zero, zero)
 
     def _at(self, times: npt.ArrayLike) -> tuple[npt.NDArray[np.intp], FloatArray]:
+        """Find the piece in force at each of `times`, and the time since its start [s]."""
         t = np.asarray(times, dtype=np.float64)
         index = np.clip(np.searchsorted(self.times, t, side="right") - 1, 0, None)
         return index, np.maximum(t - self.times[index], 0.0)
 
     def positions(self, times: npt.ArrayLike) -> FloatArray:
-        """Positions at `times` [s], same shape."""
+        """Compute positions at `times` [s], of the same shape."""
         i, dt = self._at(times)
         return np.asarray(self.x[i] + dt * (self.v[i] + 0.5 * self.a[i] * dt))
 
     def velocities(self, times: npt.ArrayLike) -> FloatArray:
-        """Velocities at `times` [s], same shape."""
+        """Compute velocities at `times` [s], of the same shape."""
         i, dt = self._at(times)
         return np.asarray(self.v[i] + self.a[i] * dt)
 
 
 def at_rest(position: float, time: float = 0.0) -> Trajectory:
-    """A motor standing still at `position`.
+    """Make the trajectory of a motor that stands at `position`.
 
     Example:
         >>> at_rest(5.0).position(100.0)
@@ -231,10 +232,11 @@ def at_rest(position: float, time: float = 0.0) -> Trajectory:
 def move(
     position: float, velocity: float, target: float, speed: float, acceleration: float, time: float
 ) -> Trajectory:
-    """Fastest trapezoidal motion to rest at `target` from any state of motion.
+    """Plan the fastest trapezoidal motion to rest at `target` from any state of motion.
 
-    Velocity is continuous. A motor that is too fast to stop in time, or runs the wrong way, brakes
-    to rest first and then comes back; one that is faster than `speed` brakes to it first.
+    Velocity is continuous. A motor that is too fast to stop in time, or runs the wrong
+    way, brakes to rest first and then comes back; one that is faster than `speed` brakes
+    to it first.
 
     Args:
         position: where the motor is.
@@ -275,7 +277,7 @@ def move(
 
 
 def stop(position: float, velocity: float, acceleration: float, time: float) -> Trajectory:
-    """Brake to rest as fast as allowed.
+    """Plan the fastest stop.
 
     Example:
         >>> s = stop(0.0, velocity=2.0, acceleration=4.0, time=0.0)
@@ -291,9 +293,10 @@ def stop(position: float, velocity: float, acceleration: float, time: float) -> 
 def jog(
     position: float, velocity: float, wanted: float, lease: float, acceleration: float, time: float
 ) -> Trajectory:
-    """Run at velocity `wanted` (signed) until `lease` seconds from now, then brake to rest.
+    """Plan a run at velocity `wanted` (signed) for `lease` seconds, then braking to rest.
 
-    Where the lease is shorter than the ramp, the motor brakes from what it has reached by then.
+    Where the lease is shorter than the ramp, the motor brakes from what it has reached by
+    then.
 
     Example:
         >>> jog(0.0, 0.0, wanted=2.0, lease=1.0, acceleration=4.0, time=0.0).end
@@ -313,7 +316,7 @@ def jog(
 
 
 def rejoined(before: Trajectory, at: float, after: Trajectory) -> Trajectory:
-    """`before` until time `at`, then `after`, which begins there.
+    """Join `before` until time `at` and `after`, which begins there.
 
     Example:
         >>> m = move(0.0, 0.0, target=10.0, speed=2.0, acceleration=4.0, time=0.0)
@@ -326,7 +329,7 @@ def rejoined(before: Trajectory, at: float, after: Trajectory) -> Trajectory:
 
 
 def continued(trajectory: Trajectory, at: float) -> Trajectory:
-    """What is left of `trajectory` from time `at` on.
+    """Cut off the part of `trajectory` before time `at`.
 
     Example:
         >>> m = move(0.0, 0.0, target=10.0, speed=2.0, acceleration=4.0, time=0.0)
@@ -345,10 +348,11 @@ def continued(trajectory: Trajectory, at: float) -> Trajectory:
 
 
 def joined(trajectories: Sequence[Trajectory]) -> Trajectory:
-    """One trajectory that does what `trajectories` do, each from its start until the next begins.
+    """Join trajectories, each followed from its start until the next begins.
 
     Args:
-        trajectories: at least one, in the order of their starts; each begins where the motor is.
+        trajectories: at least one, in the order of their starts; each begins where the
+            motor is.
 
     Example:
         >>> m = move(0.0, 0.0, target=10.0, speed=2.0, acceleration=4.0, time=0.0)
@@ -367,7 +371,7 @@ def joined(trajectories: Sequence[Trajectory]) -> Trajectory:
 
 
 def require_positive(value: float, name: str) -> None:
-    """Raise ValueError unless `value` is positive and finite."""
+    """Check that `value` is positive and finite; raise ValueError otherwise."""
     if not (math.isfinite(value) and value > 0):
         raise ValueError(f"{name} is {value}; it must be positive and finite")
 
@@ -381,6 +385,7 @@ class _Builder:
         self.pieces: list[Piece] = []
 
     def _add(self, dt: float, acceleration: float) -> None:
+        """Add a piece of `dt` seconds, unless that is none."""
         if dt <= 0.0:
             return
         self.pieces.append(Piece(self.time, self.position, self.velocity, acceleration))
@@ -388,20 +393,23 @@ class _Builder:
         self.time += dt
 
     def ramp(self, velocity: float, acceleration: float) -> None:
+        """Add a change to `velocity`."""
         change = velocity - self.velocity
         self._add(abs(change) / acceleration, math.copysign(acceleration, change))
         self.velocity = velocity
 
     def coast(self, dt: float) -> None:
+        """Add `dt` seconds at constant velocity."""
         self._add(dt, 0.0)
 
     def rest_at(self, target: float) -> Trajectory:
+        """Return the trajectory, at rest at `target` from now on."""
         pieces = self.pieces or [Piece(self.begin[0], target, 0.0, 0.0)]
         return Trajectory(tuple(pieces), self.time, target)
 
 
 def _first_root(a: float, b: float, c: float) -> float | None:
-    """Smallest non-negative root of a x^2 + b x + c, or None."""
+    """Solve for the smallest non-negative root of a x^2 + b x + c, or None."""
     if c == 0.0:
         return 0.0
     if a == 0.0:

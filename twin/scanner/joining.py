@@ -20,7 +20,7 @@ from typing import Literal
 
 from flexdt.twin.errors import CollisionError, SafetyError
 from flexdt.twin.machine.description import Machine
-from flexdt.twin.machine.travel import SAME_PLACE
+from flexdt.twin.machine.travel import POSITION_ROUNDING
 from flexdt.twin.motion import profiles as motion
 from flexdt.twin.motion.braking import (
     Most,
@@ -219,8 +219,8 @@ class Lookahead:
             return None
         ((name, planned),) = new.items()
         current = self.drives[name].at(self.now)
-        speed = max(planned.top_speed, motion.LEAST_RATE)
-        acceleration = max(planned.acceleration(self.now), motion.LEAST_RATE)
+        speed = max(planned.top_speed, motion.MIN_RATE)
+        acceleration = max(planned.acceleration(self.now), motion.MIN_RATE)
         way = current.redirected(contact.last_free[name], speed, acceleration, self.now)
         halted = {name: way}
         return halted if self.contact(halted) is None else None
@@ -357,7 +357,7 @@ class Lookahead:
         """
         axes = self.machine.axes
         return all(
-            axes[name].lower - SAME_PLACE <= t.target <= axes[name].upper + SAME_PLACE
+            axes[name].lower - POSITION_ROUNDING <= t.target <= axes[name].upper + POSITION_ROUNDING
             for name, t in trajectories.items()
         )
 

@@ -62,7 +62,8 @@ class Command:
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """The fields of its own type, which not all commands have."""
+        """Fields of the command's own type, by name; those that all commands have are
+        left out."""
         return {f.name: getattr(self, f.name) for f in fields(self)[len(fields(Command)) :]}
 
 
@@ -206,16 +207,19 @@ class Custom(Command):
 
 
 def _all_commands(cls: type[Command] = Command) -> dict[str, type[Command]]:
+    """List a command type and its subclasses by class name."""
     below = {k: v for sub in cls.__subclasses__() for k, v in _all_commands(sub).items()}
     return {cls.__name__: cls, **below}
 
 
 def _to_json(command: Command) -> dict[str, Any]:
+    """Serialise a command to its fields and `command`, the name of its type."""
     fields = adapter_of(type(command)).dump_python(command, mode="json")
     return {"command": type(command).__name__, **fields}
 
 
 def _from_json(value: Any) -> Command:
+    """Read a command back from what `_to_json` wrote; a Command passes unchanged."""
     if isinstance(value, Command):
         return value
     fields = dict(value)
@@ -248,6 +252,6 @@ class Script:
 
     @classmethod
     def of(cls, commands: Iterable[Command]) -> Script:
-        """A script made in memory."""
+        """Make a script from commands in memory."""
         made = tuple(commands)
         return cls(made, (), max((c.line for c in made), default=0))

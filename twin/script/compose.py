@@ -33,14 +33,16 @@ from flexdt.twin.script.scan_request import ScanPosition, ScanRequest
 
 MAX_FRAMES: Final = 100_000
 _ROUNDED_MM: Final = 1e-4
-"""What scripts with six decimals may miss of a quantity."""
+"""Largest difference from a requested quantity that six decimals may cause [mm]."""
 BESIDE: Final = 0.1
-"""How far beside the beam may stand what no motor moves, as part of the field of view: zero offsets
-are of that kind, a machine built otherwise is not (assumed)."""
+"""Largest distance from the beam, as a part of the field of view, that no motor has to correct.
+
+Zero offsets are of that kind, a machine built otherwise is not (assumed).
+"""
 
 
 def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> str:
-    """The text of a script for a requested scan.
+    """Compose the text of a script for a requested scan.
 
     Args:
         request: the scan; it is checked before anything is written.
@@ -48,8 +50,11 @@ def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> 
         profile: zero offsets, so that source, detector and sample are centred.
 
     Raises:
-        LimitError: a count, distance or speed that the machine does not allow, or a motion for
-            which it has no motor; says which.
+        LimitError: a count, distance or speed that the machine does not allow, or a
+            motion for which it has no motor; says which.
+
+    Returns:
+        TAB separated lines with CRLF, as `parse_script` reads them.
     """
     panel, tube = machine.detector, machine.tube
     exposure = panel.exposure_ms if request.exposure_ms is None else request.exposure_ms
@@ -81,7 +86,8 @@ def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> 
 
 
 def _usual(request: ScanRequest, places: MotorTargets) -> Iterator[tuple[float, float, float]]:
-    """SOD, SDD and height as asked for, else as is usual, else as at home, to be tried in turn."""
+    """Yield SOD, SDD and height to try: as requested, else the usual ones, else those at
+    home [mm]."""
 
     def tried(asked: float | None, *usual: float) -> Iterable[float]:
         return dict.fromkeys(usual) if asked is None else (asked,)
@@ -108,9 +114,12 @@ class _Request(ScanRequest):
 
 @dataclass(frozen=True)
 class _Writer(MotorTargets):
+    """Writes the rows of a script; methods named after a kind of scan yield its rows."""
+
     request: _Request
 
     def rows(self) -> Iterator[str]:
+        """Yield all rows: output path, settings, dark and flat images, the scan, X-rays off."""
         w = self.request
         out = self.out_of_beam()
         yield _row("scanner", "pause", "0.000000")
@@ -124,6 +133,7 @@ class _Writer(MotorTargets):
         yield _row("tube", "xrayoff")
 
     def settings(self) -> Iterator[str]:
+        """Yield the rows that set tube and camera."""
         w, m = self.request, self.machine
         camera = self.camera
         yield _row("tube", "set kV", _f(m.tube.kV if w.kV is None else w.kV))
@@ -133,7 +143,7 @@ class _Writer(MotorTargets):
         yield _row("camera", "set ROI", str(camera.roi))
 
     def references(self) -> Iterator[str]:
-        """Dark and flat with the sample out of the beam; X-rays stay on."""
+        """Yield dark and flat images with the sample out of the beam; X-rays stay on."""
         w = self.request
         yield _row("camera", "set number of frames", "1")
         yield _row("tube", "xrayoff")
@@ -144,10 +154,12 @@ class _Writer(MotorTargets):
         yield from self.image("io000000.tif", w.flats)
 
     def fly(self) -> Iterator[str]:
+        """Yield one smooth turn."""
         yield from self.go(*self.aside)
         yield from self.turn(360.0, self.request.frames, 0)
 
     def step(self) -> Iterator[str]:
+        """Yield a turn that stops for every image."""
         w = self.request
         name, rotation = self.rotation
         yield from self.go(*self.aside)
@@ -161,6 +173,7 @@ class _Writer(MotorTargets):
             yield _row("camera", "save image", f"{w.folder}\\scan_{i:06d}.tif")
 
     def tiled(self) -> Iterator[str]:
+        """Yield smooth turns with the detector side by side; neighbours share a tenth."""
         w, camera = self.request, self.camera
         self.need("a tiled scan", "detector_x")
         width = camera.shape[1] * camera.pixel_mm(self.machine.detector.pixels)
@@ -170,6 +183,7 @@ class _Writer(MotorTargets):
             yield from self.turn(360.0, w.frames, k * w.frames)
 
     def calibration(self) -> Iterator[str]:
+        """Yield a smooth turn for each placement of the sample."""
         w = self.request
         for k, place in enumerate(w.placements):
             moved = ("object_y",) if "object_y" in self.drivers else ()
@@ -177,9 +191,13 @@ class _Writer(MotorTargets):
             yield from self.turn(360.0, w.frames, k * w.frames)
 
     def helical(self) -> Iterator[str]:
-        """Source and detector rise at constant speed from before the trigger to after the end.
+        """Yield several turns while source and detector rise at constant speed.
 
-        Where no motors raise them, the sample sinks.
+        They rise from before the trigger to after the end. Where no motors raise them,
+        the sample sinks.
+
+        Raises:
+            LimitError: no motors for it, or a rise that is too fast for the run-up.
         """
         w, m = self.request, self.machine
         name, rotation = self.rotation
@@ -235,13 +253,16 @@ class _Writer(MotorTargets):
         yield from self.drive(name, rotation.speed, rotation.acceleration)
 
     def turn(self, total: float, frames: int, first: int) -> Iterator[str]:
-        """A smooth scan of `frames` images over `total` degrees from angle 0, and its run-up."""
+        """Yield a smooth scan of `frames` images over `total` degrees from angle 0, and
+        its run-up."""
         name, rotation = self.rotation
         yield from self.run_up(total, frames)
         yield from self.sweep(total, frames, first)
         yield from self.drive(name, rotation.speed, rotation.acceleration)
 
     def run_up(self, total: float, frames: int) -> Iterator[str]:
+        """Yield the move to the start of the run-up, the scan's speed and its numbers of
+        images."""
         name, rotation = self.rotation
         yield from self.drive(name, rotation.speed, rotation.acceleration)
         yield _row(name, "move absolute", _f(-self.run_up_deg(total, frames)))
@@ -251,6 +272,7 @@ class _Writer(MotorTargets):
         yield _row("scanner", "write settings file")
 
     def sweep(self, total: float, frames: int, first: int) -> Iterator[str]:
+        """Yield the move over `total` degrees and the image sequence that it triggers."""
         name = self.rotation[0]
         end = check_target(self.machine, name, total + self.run_up_deg(total, frames))
         yield _row(name, "move absolute", _f(end), "0.000000", "POS")
@@ -259,7 +281,7 @@ class _Writer(MotorTargets):
         )
 
     def turn_speed(self, total: float, frames: int) -> float:
-        """Speed of a smooth scan [deg/s].
+        """Compute the speed of a smooth scan [deg/s].
 
         Raises:
             LimitError: faster than the axis turns.
@@ -276,13 +298,14 @@ class _Writer(MotorTargets):
         return speed
 
     def run_up_deg(self, total: float, frames: int) -> float:
+        """Compute the length of the run-up [deg]."""
         speed = self.turn_speed(total, frames)
         return run_up(speed, self.rotation[1].acceleration, self.image_s)
 
     def go(
         self, *quantities: str, place: ScanPosition | None = None, shift: float = 0.0
     ) -> Iterator[str]:
-        """Move only the motors of `quantities` to their station."""
+        """Yield moves of the motors of `quantities` alone to their station."""
         at = ScanPosition(self.request.sod_mm) if place is None else place
         every = self.station(at.sod_mm, at.lateral_mm, shift)
         names = map(self.driver, quantities)
@@ -291,10 +314,18 @@ class _Writer(MotorTargets):
     def station(
         self, sod: float, lateral: float = 0.0, detector_shift: float = 0.0
     ) -> dict[str, float]:
-        """Motor targets that put everything where it belongs, checked against travel limits.
+        """Compute the motor targets that put source, detector and sample in their places.
+
+        Args:
+            sod: source-object distance [mm].
+            lateral: of the sample from the beam's middle [mm].
+            detector_shift: of the detector sideways [mm].
+
+        Returns:
+            Motor -> target [mm, deg], within its travel.
 
         Raises:
-            LimitError: beyond a limit, or motors do not set what is asked for.
+            LimitError: beyond a travel limit, or motors do not set what is requested.
         """
         w = self.request
         height = w.height_mm
@@ -337,17 +368,19 @@ class _Writer(MotorTargets):
         return {name: check_target(self.machine, name, value) for name, value in found.items()}
 
     def out_of_beam(self) -> dict[str, float]:
-        """Where the stage goes for the flat field: as far as the beam asks, to the freer side."""
+        """Compute the stage's targets for the flat image: beside the beam, to the freer
+        side."""
         station = self.station(self.request.sod_mm)
         return beside_beam(self.machine, self.profile, self.camera, station)[0]
 
     def image(self, file: str, averages: int) -> Iterator[str]:
+        """Yield one image of `averages` exposures, saved as `file`."""
         yield _row("camera", "set number of averages", str(averages))
         yield _row("camera", "take image")
         yield _row("camera", "save image", f"{self.request.folder}\\{file}")
 
     def moves(self, targets: dict[str, float]) -> Iterator[str]:
-        """Moves that start together; asking each again waits until all have arrived."""
+        """Yield moves that start together; the second request of each waits for its arrival."""
         if len(targets) > 1:
             for name, value in targets.items():
                 yield _row(name, "move absolute", _f(value), wait="no wait")
@@ -355,18 +388,21 @@ class _Writer(MotorTargets):
             yield _row(name, "move absolute", _f(value))
 
     def drive(self, name: str, speed: float, acceleration: float) -> Iterator[str]:
+        """Yield the speed and the acceleration of an axis."""
         yield _row(name, "set speed", f"{speed:.10f}")
         yield _row(name, "set acceleration", _f(acceleration))
 
     @property
     def camera(self) -> CameraSettings:
+        """Camera settings of the request, else the machine's."""
         w, camera = self.request, self.machine.detector.camera
         camera = camera if w.mode is None else replace(camera, mode=w.mode)
         return camera if w.roi is None else replace(camera, roi=w.roi)
 
     @property
     def region(self) -> FloatArray:
-        """The middle of the camera's region from the panel's, in the world (3,) [mm]."""
+        """Middle of the camera's region relative to the panel's middle, world frame (3,)
+        [mm]."""
         across, down = self.camera.roi_shift_mm(self.machine.detector.pixels)
         u, v = turn_detector(
             COLUMN_DIRECTION, ROW_DIRECTION, 0.0, 0.0, math.radians(self.profile.det_roll_deg)
@@ -391,10 +427,12 @@ class _Writer(MotorTargets):
 
     @property
     def image_s(self) -> float:
+        """Exposure time of an image, averages included [s]."""
         return self.request.exposure_ms * self.request.averages / 1000.0
 
 
 def _check_counts(request: _Request) -> None:
+    """Check the counts and distances of a request against their allowed ranges."""
     smooth = request.kind != "step"
     rules: Sequence[tuple[str, float, float, float]] = (
         ("frames", request.frames, 2 if smooth else 1, MAX_FRAMES),
@@ -419,8 +457,10 @@ def _check_counts(request: _Request) -> None:
 
 
 def _row(component: str, command: str, first: str = "", second: str = "", wait: str = "ACK") -> str:
+    """Format one row of seven TAB separated columns."""
     return "\t".join((component, command, first, second, wait, "", ""))
 
 
 def _f(value: float) -> str:
+    """Format a number with six decimals."""
     return f"{value:.6f}"

@@ -38,21 +38,26 @@ def check_script(
     collision: CollisionCheck | None = None,
     physics: Physics = "poly",
 ) -> CheckReport:
-    """Parse, plan and check a script; what cannot be read is reported and the rest is planned.
+    r"""Parse, plan and check a script; what cannot be read is reported and the rest is planned.
 
     Args:
         text: the script's text, bytes or path; or a script from `parse_script`.
         machine: on which it would run; the FleX-ray if None.
         profile: zero offsets in force; the machine's default if None.
-        start: the scanner before it; None assumes the machine's homes, and the report says so.
+        start: the scanner before it; None assumes the machine's homes, and the report
+            says so.
         sample: its size, for truncation; None takes what the script says, if anything.
-        collision: finds collisions and clearances over a plan; None leaves them unchecked.
+        collision: finds collisions and clearances over a plan; None leaves them
+            unchecked.
         physics: predicts whether the open beam saturates the panel.
 
     Example:
-        >>> script = "camera\\tset exposure\\t100\\t\\tACK\\t\\t\\r\\n"
+        >>> script = "camera\tset exposure\t100\t\tACK\t\t\r\n"
         >>> check_script(script).ok
         True
+
+    Returns:
+        The report; problems never raise.
     """
     problems: tuple[ScriptProblem, ...]
     if isinstance(text, c.Script):
@@ -74,7 +79,7 @@ def check_plan(
     start_known: bool = True,
     physics: Physics = "poly",
 ) -> CheckReport:
-    """The report about a plan.
+    """Check a plan: problems, collisions, truncation, saturation and dose, as a report.
 
     Args:
         plan: of a script or of poses.
@@ -101,7 +106,7 @@ def check_plan(
 
 
 def _start_problems(plan: ScanPlan) -> list[ScriptProblem]:
-    """A warning where the first projection is taken with motors that nothing has moved before."""
+    """Warn if the first projection is taken with motors that nothing has moved before."""
     seen = [group for group in plan.groups if group.kind == "projection"]
     if not seen:
         return []
@@ -121,6 +126,8 @@ def _start_problems(plan: ScanPlan) -> list[ScriptProblem]:
 
 
 def _optics(view: View) -> Optics:
+    """Describe what the images of a view show: distances, magnification, field and
+    truncation."""
     p, camera = view.poses, view.camera
     rows, cols = shape = camera.shape
     pixel = float(np.linalg.norm(p.u[0]))
@@ -146,13 +153,15 @@ def _optics(view: View) -> Optics:
 
 
 def _extent(values: FloatArray) -> tuple[float, float]:
+    """Return the least and the greatest of some values."""
     return float(np.min(values)), float(np.max(values))
 
 
 def _truncation_problems(seen: Sequence[View]) -> list[ScriptProblem]:
-    """A warning where no image of the scan shows some part of the sample's width or height.
+    """Warn if no image of the scan shows some part of the sample's width or height.
 
-    Positions of several scans of one script (tiles, helical turns) make up for each other.
+    Positions of several scans of one script (tiles, helical turns) make up for each
+    other.
     """
     found = []
     for view in seen:
@@ -167,6 +176,7 @@ def _truncation_problems(seen: Sequence[View]) -> list[ScriptProblem]:
 
 
 def _dose(plan: ScanPlan) -> Dose:
+    """Sum up a plan's beam time [s], charge [mAs] and exposing time [s]."""
     exposing = sum(
         len(g) * g.camera.exposure_ms * g.camera.averages / 1000.0
         for g in plan.groups

@@ -24,7 +24,7 @@ def html_report(report: CheckReport, name: str = "script") -> str:
 
 
 def against_summary(found: LogComparison) -> Facts:
-    """The figures of a comparison as (label, value)."""
+    """List the figures of a log comparison as (label, value)."""
     ranges = [row.inside for row in found.rows if row.inside is not None]
     return [
         ("machine", f"{found.machine.name}; timing: {found.machine.timing.source}"),
@@ -41,7 +41,7 @@ def against_summary(found: LogComparison) -> Facts:
 
 
 def summary(report: CheckReport) -> Facts:
-    """The figures of a report as (label, value)."""
+    """List the figures of a report as (label, value)."""
     plan, dose = report.plan, report.dose
     images = sum(len(g.files) for g in plan.groups)
     facts = [
@@ -65,6 +65,7 @@ def summary(report: CheckReport) -> Facts:
 
 
 def _optics_facts(o: Optics) -> Facts:
+    """List the figures of one camera setting as (label, value)."""
     where = f"line {o.lines[0]}" if o.lines[0] == o.lines[1] else f"lines {o.lines[0]}-{o.lines[1]}"
     facts = [
         (
@@ -86,6 +87,7 @@ def _optics_facts(o: Optics) -> Facts:
 
 
 def _collisions(report: CheckReport) -> str:
+    """Describe the collisions and the smallest clearance."""
     c = report.clearance
     if c is None:
         return "not checked"
@@ -97,6 +99,7 @@ def _collisions(report: CheckReport) -> str:
 
 
 def _sources(report: CheckReport) -> str:
+    """Describe how much of the commands' time is measured and how much assumed."""
     timing = report.plan.machine.timing
     parts = {"measured": 0.0, "assumed": 0.0}
     for s in report.plan.steps:
@@ -106,11 +109,12 @@ def _sources(report: CheckReport) -> str:
 
 
 def between(found: Range | None) -> str:
-    """A 90 % range in words; nothing where there is none."""
+    """Format a 90 % range [s]; "" if there is none."""
     return "" if found is None else f"{found[0]:.2f} to {found[1]:.2f}"
 
 
 def _total(report: CheckReport) -> str:
+    """Describe the 90 % range of the duration."""
     plan = report.plan
     text = between(total_range(plan.steps, plan.duration_s, plan.machine.timing))
     start = "" if report.start_known else ", if axes and X-rays start as assumed below"
@@ -118,11 +122,13 @@ def _total(report: CheckReport) -> str:
 
 
 def _time(seconds: float) -> str:
+    """Format a duration in h, min and s."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours} h {minutes} min {rest} s" if hours else f"{minutes} min {rest} s"
 
 
 def _span(pair: tuple[float, float]) -> str:
+    """Format a range, or a single number if both ends read alike."""
     low, high = (f"{x:.6g}" for x in pair)
     return low if low == high else f"{low} to {high}"

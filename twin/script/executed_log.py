@@ -24,11 +24,13 @@ COLUMNS: Final = (
     "expected, own time [ms], reply, moment (hh:mm:ss.mmm)"
 )
 MAX_OWN_S: Final = 7 * 86_400.0
-"""No command of a script takes longer; a greater time is a slip."""
-_DOUBLES: Final = 17
-_COPY: Final = 143
-"""Byte at which a motor's reply repeats its two limits."""
-_LENGTH: Final = 267
+"""Longest own time of a command that is believed [s]; a greater one is a slip."""
+_REPLY_DOUBLES: Final = 17
+"""Number of doubles at the start of a motor's reply."""
+_LIMITS_COPY_BYTE: Final = 143
+"""Byte offset at which a motor's reply repeats its two limits."""
+_REPLY_BYTES: Final = 267
+"""Length of a motor's reply [bytes]."""
 
 
 @dataclass(frozen=True)
@@ -73,17 +75,18 @@ class Executed:
 
 
 def read_log(data: bytes) -> tuple[tuple[Executed, ...], tuple[ScriptProblem, ...]]:
-    """The lines of an executed script that could be read, and what is wrong with the others.
+    r"""Read the lines of an executed script.
 
     Args:
         data: the file's bytes, since replies are binary.
 
     Returns:
-        Lines in order, and problems: an error for each line that does not hold, a warning for a
+        Lines in order, and problems: an error for each line that does not hold, a warning
+        for a
         last line that is cut off and for a motor's reply that is not as expected.
 
     Example:
-        >>> (line,), found = read_log(b"tube\\txrayoff\\t\\t\\tACK\\t\\t\\t501\\t\\t09:36:31.952")
+        >>> (line,), found = read_log(b"tube\txrayoff\t\t\tACK\t\t\t501\t\t09:36:31.952")
         >>> line.own_s, type(line.command).__name__, found
         (0.501, 'XrayOff', ())
     """
@@ -105,6 +108,17 @@ def read_log(data: bytes) -> tuple[tuple[Executed, ...], tuple[ScriptProblem, ..
 def _line(
     record: bytes, stamp: re.Match[bytes], number: int, problems: list[ScriptProblem]
 ) -> Executed:
+    """Read one line of a log; warn if the motor's reply does not fit its move.
+
+    Args:
+        record: the line without its moment.
+        stamp: match of `LOG_STAMP` that ends the line.
+        number: of the line, from 1.
+        problems: list to which problems are added.
+
+    Raises:
+        ArgumentError: the line cannot be read.
+    """
     wait = _WAIT.search(record)
     tail = [] if wait is None else record[wait.end() + 1 :].split(b"\t", 3)
     if wait is None or len(tail) < 3:
@@ -131,22 +145,22 @@ def _line(
             motor = None
             what = (
                 f"the reply of {shorten(command.component)} ({len(reply)} bytes) is left out: it "
-                f"must begin with {_DOUBLES} big-endian doubles (position near the target, limits "
-                "twice)"
+                f"must begin with {_REPLY_DOUBLES} big-endian doubles (position near the target, "
+                "limits twice)"
             )
             problems.append(ScriptProblem("warning", "reply", number, 1, what))
     return Executed(command, own, 3600 * hour + 60 * minute + second, reply, motor)
 
 
 def _arrived(motor: MotorReply, target: float) -> bool:
-    """Whether the reply is about this move: its target is the script's, or the limit before it."""
+    """Return whether a reply is about a move to `target`, or to the limit before it."""
     allowed = min(max(target, motor.lower), motor.upper)
     near = 1e-3 * (1.0 + abs(allowed))
     return abs(motor.target - allowed) <= near and abs(motor.position - motor.target) <= 1.0 + near
 
 
 def log_line(words: tuple[str, ...], wait: str, own_s: float, reply: bytes, stamp: str) -> bytes:
-    """One line of a log, as `read_log` reads it.
+    """Format one line of a log, as `read_log` reads it.
 
     Args:
         words: component, command, argument 1, argument 2.
@@ -166,7 +180,7 @@ def log_line(words: tuple[str, ...], wait: str, own_s: float, reply: bytes, stam
 
 
 def reply_bytes(text: str) -> bytes:
-    """A text's bytes: one for each character, as clusters come; or UTF-8."""
+    """Encode a text as Latin-1 (one byte a character, as replies have), else as UTF-8."""
     try:
         return text.encode("latin-1")
     except UnicodeEncodeError:
@@ -174,36 +188,38 @@ def reply_bytes(text: str) -> bytes:
 
 
 def motor_cluster(motor: MotorReply) -> bytes:
-    """A motor's answer in the scanner's form, as far as it is known; the other bytes are zero.
+    """Encode a motor's reply in the scanner's form; unknown bytes are zero.
 
     Example:
         >>> axis = MotorReply(90.0, 90.0, 45.0, 45.0, -360.0, 360.0, 200.0, 300.0)
         >>> motor_reply(motor_cluster(axis)) == axis, len(motor_cluster(axis))
         (True, 267)
     """
-    m, made = motor, bytearray(_LENGTH)
+    m, made = motor, bytearray(_REPLY_BYTES)
     head = (m.position, m.target, m.speed, 0.0, m.acceleration, m.upper, m.lower, 0.0, m.max_speed,
             0.0, m.max_acceleration)  # fmt: skip
     struct.pack_into(f">{len(head)}d", made, 0, *head)
-    struct.pack_into(">2d", made, _COPY, m.upper, m.lower)
+    struct.pack_into(">2d", made, _LIMITS_COPY_BYTE, m.upper, m.lower)
     return bytes(made)
 
 
 def motor_reply(reply: bytes) -> MotorReply | None:
-    """Decode the answer of a motor; None where it is not one.
+    """Decode a motor's reply; None if it is not one.
 
     Args:
-        reply: column 9: 17 big-endian doubles (0 position, 1 target, 2 speed, 4 acceleration,
-            5 upper and 6 lower limit, 8 greatest speed, 10 greatest acceleration), then others, the
-            two limits among them once more.
+        reply: column 9: 17 big-endian doubles (0 position, 1 target, 2 speed, 4
+            acceleration, 5 upper and 6 lower limit, 8 greatest speed, 10 greatest
+            acceleration), then others, the two limits among them once more.
     """
-    if len(reply) < _COPY + 16:
+    if len(reply) < _LIMITS_COPY_BYTE + 16:
         return None
-    if max(reply[: _COPY + 16]) < 0x80:  # saved as plain text: every high byte became another one
+    if (
+        max(reply[: _LIMITS_COPY_BYTE + 16]) < 0x80
+    ):  # saved as plain text: every high byte became another one
         return None
-    v = struct.unpack_from(f">{_DOUBLES}d", reply)
+    v = struct.unpack_from(f">{_REPLY_DOUBLES}d", reply)
     found = MotorReply(v[0], v[1], v[2], v[4], v[6], v[5], v[8], v[10])
-    copy = struct.unpack_from(">2d", reply, _COPY)
+    copy = struct.unpack_from(">2d", reply, _LIMITS_COPY_BYTE)
     sound = all(abs(x) <= 1e9 for x in vars(found).values())
     rates = 0 < found.speed <= found.max_speed and 0 < found.acceleration <= found.max_acceleration
     if not sound or not rates or found.max_speed > 1e6 or found.max_acceleration > 1e6:

@@ -16,14 +16,14 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from flexdt.twin.machine.camera import Roi
-from flexdt.twin.motion.profiles import LEAST_RATE
+from flexdt.twin.motion.profiles import MIN_RATE
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.commands import ImageKind
 
 MAX_FRAMES: Final = 1_000_000
 MAX_AVERAGES: Final = 100_000
 MAX_NUMBER: Final = 1e9
-"""Above it no argument of a scanner makes sense, and arithmetic need not fear it."""
+"""Greatest absolute value of an argument; it keeps arithmetic from overflowing."""
 
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 _RESERVED = re.compile(r"(?:mag|rot|tra|ver).*|.*(?:obj|tube|det)", re.IGNORECASE | re.DOTALL)
@@ -35,7 +35,8 @@ _DEVICE = re.compile(r"(?:con|prn|aux|nul|com\d|lpt\d)(?:\..*)?", re.IGNORECASE)
 _SUFFIX = re.compile(r".*\.tiff?", re.IGNORECASE | re.DOTALL)
 _DARK = re.compile(r"di[_-]?\d*(?:\.tiff?)?", re.IGNORECASE)
 _FLAT = re.compile(r"io[_-]?\d*(?:\.tiff?)?", re.IGNORECASE)
-MAX_NAME = 120
+MAX_NAME_CHARS = 120
+"""Longest file name [characters]."""
 _GOES_ON: Final[Mapping[c.Wait, str]] = {
     c.Wait.NO_WAIT: ", goes on at once",
     c.Wait.RCV: ", goes on when received",
@@ -65,7 +66,7 @@ class Spec:
 
 
 def encode(text: str) -> bytes:
-    """The bytes that `decode` was given."""
+    """Encode a script's text; the inverse of `decode` of `parse`."""
     try:
         return text.encode("utf-8", "surrogateescape")
     except UnicodeEncodeError:  # a str with lone surrogates that never came from bytes
@@ -73,10 +74,15 @@ def encode(text: str) -> bytes:
 
 
 def number(text: str, what: str, index: int = 0) -> float:
-    """A finite decimal number.
+    """Read a finite decimal number.
 
     Raises:
         ArgumentError: the text is not one.
+
+    Args:
+        text: of the argument.
+        what: name of the argument, for the message.
+        index: place of the argument, 0 or 1.
     """
     value = float(text) if _NUMBER.fullmatch(text) else math.nan
     if not math.isfinite(value):
@@ -89,15 +95,15 @@ def number(text: str, what: str, index: int = 0) -> float:
 
 
 def positive(text: str, what: str) -> float:
-    """A number above zero, by a margin that no setting of a scanner goes below."""
+    """Read a number of at least `MIN_RATE`, below which no setting of a scanner goes."""
     value = number(text, what)
-    if value < LEAST_RATE:
-        raise ArgumentError(f"{what} is {shorten(text)}; it must be at least {LEAST_RATE:g}")
+    if value < MIN_RATE:
+        raise ArgumentError(f"{what} is {shorten(text)}; it must be at least {MIN_RATE:g}")
     return value
 
 
 def not_negative(text: str, what: str) -> float:
-    """A number from zero up."""
+    """Read a number from zero up."""
     value = number(text, what)
     if value < 0:
         raise ArgumentError(f"{what} is {shorten(text)}; it must not be negative")
@@ -105,7 +111,7 @@ def not_negative(text: str, what: str) -> float:
 
 
 def whole(text: str, what: str, low: int, high: int, index: int = 0) -> int:
-    """A whole number from `low` to `high`; `1440.000000` is one too."""
+    """Read a whole number from `low` to `high`; `1440.000000` is one too."""
     value = number(text, what, index)
     if not value.is_integer() or not low <= value <= high:
         raise ArgumentError(
@@ -116,17 +122,17 @@ def whole(text: str, what: str, low: int, high: int, index: int = 0) -> int:
 
 
 def shorten(text: str, length: int = 60) -> str:
-    """Text for a message: never longer than `length` characters."""
+    """Shorten a text for a message to at most `length` characters."""
     return text if len(text) <= length else text[: length - 3] + "..."
 
 
 def is_reserved(component: str) -> bool:
-    """Whether the name follows the scanner's naming of motors (mag*, *obj, ...)."""
+    """Return whether the name follows the scanner's naming of motors (mag*, *obj, ...)."""
     return _RESERVED.fullmatch(component) is not None
 
 
 def own_name(component: str, axes: Iterable[str]) -> str:
-    """The name as the scanner itself writes it: scripts and interface do not tell case apart.
+    """Return the name as the scanner itself writes it; scripts do not distinguish case.
 
     Example:
         >>> own_name("CAMERA", ()), own_name("rot", ("X", "Rot")), own_name("Pump", ())
@@ -137,10 +143,13 @@ def own_name(component: str, axes: Iterable[str]) -> str:
 
 
 def _nothing(_a: str, _b: str) -> dict[str, object]:
+    """Read a command without arguments."""
     return {}
 
 
 def _text(field: str, what: str) -> Read:
+    """Make the reader of one required text; `what` is its name for the message."""
+
     def read(a: str, _b: str) -> dict[str, object]:
         if not a:
             raise ArgumentError(f"{what} is missing")
@@ -150,12 +159,14 @@ def _text(field: str, what: str) -> Read:
 
 
 def _keep(a: str, _b: str) -> dict[str, object]:
+    """Read TRUE or FALSE."""
     if a.upper() not in ("TRUE", "FALSE"):
         raise ArgumentError(f"keep xrayon is {shorten(a)!r}; allowed: TRUE, FALSE")
     return {"keep": a.upper() == "TRUE"}
 
 
 def _roi(a: str, _b: str) -> dict[str, object]:
+    """Read the four edges of a ROI."""
     parts = a.replace(",", " ").replace(";", " ").split()
     if len(parts) != 4:
         raise ArgumentError(
@@ -168,11 +179,13 @@ def _roi(a: str, _b: str) -> dict[str, object]:
 
 
 def _sequence(a: str, b: str) -> dict[str, object]:
+    """Read the prefix and the first number of a sequence."""
     first = whole(b, "first number of the sequence", 0, 999_999, 1) if b else 0
     return {"prefix": a, "first": first}
 
 
 def _move(a: str, b: str) -> dict[str, object]:
+    """Read the target and the trigger position of a move."""
     trigger = number(b, "trigger position", 1) if b else None
     return {"target": number(a, "target"), "trigger": trigger}
 
@@ -231,19 +244,24 @@ _BY_KEY = {
 
 
 def vocabulary(component: str) -> tuple[str, ...]:
-    """The commands that `component` knows, as they are written."""
+    """List the commands that `component` knows, as they are written."""
     return tuple(FIXED.get(component.lower(), _MOTOR))
 
 
 def find(component: str, command: str) -> Spec | None:
-    """The command of `component`, case and blanks aside; motors share one vocabulary."""
+    """Look up the command of `component`, case and blanks aside; motors share one
+    vocabulary."""
     table = _BY_KEY.get(component.lower()) or _BY_KEY[""]
     spec = table.get(command.lower())
     return spec if spec is not None else table.get(" ".join(command.lower().split()))
 
 
 def match(component: str, words: list[str]) -> tuple[Spec, int] | None:
-    """The longest command of `component` that `words` begin with, and its number of words."""
+    """Find the longest command of `component` that `words` begin with.
+
+    Returns:
+        The command and its number of words, or None.
+    """
     for count in range(min(len(words), 5), 0, -1):
         spec = find(component, " ".join(words[:count]))
         if spec is not None:
@@ -252,14 +270,15 @@ def match(component: str, words: list[str]) -> tuple[Spec, int] | None:
 
 
 def bare_name(path: str) -> str:
-    r"""The last part of `path` (after \ or /) with unsafe characters as `_`; may be empty."""
+    r"""Return the last part of `path` (after \ or /), unsafe characters as `_`; may be
+    empty."""
     name = re.split(r"[\\/]", path)[-1]
-    name = _UNSAFE.sub("_", name).strip(" .")[:MAX_NAME]
+    name = _UNSAFE.sub("_", name).strip(" .")[:MAX_NAME_CHARS]
     return f"_{name}" if _DEVICE.fullmatch(name) else name
 
 
 def image_name(path: str) -> str | None:
-    """File name of one image, with `.tif`; None if the path does not end with a name."""
+    """Return the file name of one image, with `.tif`; None if the path ends without a name."""
     name = bare_name(path)
     if not name or name.lower() in ("tif", "tiff"):
         return None
@@ -267,19 +286,20 @@ def image_name(path: str) -> str | None:
 
 
 def sequence_names(prefix: str, first: int, count: int) -> tuple[str, ...]:
-    """File names of a sequence: prefix, six digits, `.tif`."""
+    """List the file names of a sequence: prefix, six digits, `.tif`."""
     name = bare_name(prefix) if not prefix.endswith(("\\", "/")) else ""
     return tuple([f"{name}{i:06d}.tif" for i in range(first, first + count)])
 
 
 def kind_of(name: str) -> ImageKind:
-    """What an image is for, by its name: di* dark, io* flat, everything else a projection."""
+    """Determine an image's kind by its name: di* dark, io* flat, else projection."""
     if _DARK.fullmatch(name):
         return "dark"
     return "flat" if _FLAT.fullmatch(name) else "projection"
 
 
 def _move_line(k: c.MoveAbsolute) -> str:
+    """Describe a move."""
     until = f", goes on at {k.trigger:g}" if k.wait is c.Wait.POS and k.trigger is not None else ""
     return f"{k.component} to {k.target:.10g}{until}"
 
@@ -311,5 +331,5 @@ _LINES: Final[Mapping[type[c.Command], Callable[[Any], str]]] = {
 
 
 def describe(command: c.Command) -> str:
-    """One readable line for `command`, for reports and progress."""
+    """Describe `command` in one readable line, for reports and progress."""
     return _LINES[type(command)](command) + _GOES_ON.get(command.wait, "")

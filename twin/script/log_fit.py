@@ -40,15 +40,17 @@ from flexdt.twin.script.planning.time_ranges import Range, step_range, total_ran
 from flexdt.twin.script.problems import ScriptProblem
 
 BORROWED_TIMES: Final = 4.0
-"""How many times of its own the deviations of all kinds count for."""
-_TAIL: Final = 0.05
-_FLOOR_S: Final = 0.003
+"""Weight of the deviations of all kinds, in number of a kind's own times."""
+_TAIL_PROBABILITY: Final = 0.05
+"""Probability of a time below the range, and of one above it."""
+_LOG_OFFSET_S: Final = 0.003
 """Added to a time before its logarithm: a few times the resolution, since times may be 0."""
 RESOLUTION_S: Final = 0.001
-"""Of column 8: a time of n ms is known to half of it."""
-_AT_ONCE_S: Final = 0.05
-"""A wait for the X-rays as short as this found them ready and does not say how long that takes."""
-_DECIMALS: Final = 4
+"""Resolution of own times in column 8 [s]."""
+_MAX_READY_WAIT_S: Final = 0.05
+"""Longest wait for X-rays that were ready already [s]; it tells no warm-up time."""
+_TIME_DECIMALS: Final = 4
+"""Number of decimals of times in the machine file."""
 
 Log = Sequence[Executed]
 Times = Sequence[float]
@@ -74,7 +76,7 @@ class Fit:
 
     @property
     def cross_validated_s(self) -> float:
-        """The same with each time predicted from the other times of its kind, if there are any."""
+        """Sum of absolute errors with each time predicted from the others of its kind [s]."""
         total = self.lines.sum_abs_error_s
         for kind, times in self.samples.items():
             middle = self.machine.timing.seconds(kind)
@@ -83,7 +85,7 @@ class Fit:
         return total
 
     def to_dict(self) -> dict[str, object]:
-        """The JSON document of `flexdt machine fit`."""
+        """Return the JSON document of `flexdt machine fit`."""
         timing = self.machine.timing
         return {
             "axes": {
@@ -124,19 +126,20 @@ class LogRow:
 
     @property
     def error_s(self) -> float:
-        """Real less predicted."""
+        """Real minus predicted time [s]."""
         return self.real_s - self.predicted_s
 
     @property
     def inside(self) -> bool | None:
-        """Whether the real time lies in the range, to the resolution of the log."""
+        """Whether the real time is in the 90 % range, to the log's resolution; None
+        without one."""
         if self.p5_s is None or self.p95_s is None:
             return None
         half = 0.5 * RESOLUTION_S + 1e-9
         return self.p5_s - half <= self.real_s <= self.p95_s + half
 
     def to_dict(self) -> dict[str, object]:
-        """JSON form."""
+        """Return the JSON form: all fields, error_s and inside."""
         return {**vars(self), "error_s": self.error_s, "inside": self.inside}
 
 
@@ -163,12 +166,12 @@ class LogComparison:
 
     @property
     def total_real_s(self) -> float:
-        """Sum of the lines' own times."""
+        """Sum of the lines' own times [s]."""
         return sum(row.real_s for row in self.rows)
 
     @property
     def total_predicted_s(self) -> float:
-        """Sum of their predictions."""
+        """Sum of the lines' predicted times [s]."""
         return sum(row.predicted_s for row in self.rows)
 
     @property
@@ -178,7 +181,7 @@ class LogComparison:
 
     @property
     def total_range(self) -> Range | None:
-        """90 % range of the sum of own times, if the axes start where the machine has them."""
+        """90 % range of the sum of own times [s], with axes starting at home."""
         return total_range(self.rows, self.total_predicted_s, self.machine.timing)
 
     @property
@@ -187,7 +190,7 @@ class LogComparison:
         return sorted(self.rows, key=lambda row: -abs(row.error_s))
 
     def table(self) -> list[tuple[str, ...]]:
-        """The same as text, for `HEADER`."""
+        """Format the lines as rows of text below `HEADER`, greatest error first."""
         return [
             (
                 str(r.line),
@@ -201,7 +204,7 @@ class LogComparison:
         ]
 
     def to_dict(self) -> dict[str, object]:
-        """The JSON document of `flexdt check --against`."""
+        """Return the JSON document of `flexdt check --against`."""
         return {
             "machine": self.machine.name,
             "timing_source": self.machine.timing.source,
@@ -215,7 +218,7 @@ class LogComparison:
 
 
 def first_difference(script: Sequence[c.Command], log: Log) -> str | None:
-    """Where a script and a log part, in words; None where the log is one of the script."""
+    """Describe where a script and a log differ; None if the log is of that script."""
     for i in range(max(len(script), len(log))):
         if i >= len(script) or i >= len(log):
             longer = "script" if i >= len(log) else "log"
@@ -269,7 +272,7 @@ def fit_machine(logs: Sequence[Log], base: Machine, source: str) -> Fit:
 
 
 def against_log(log: Log, machine: Machine) -> list[LogRow]:
-    """Each line of an executed script beside its prediction, in the log's order."""
+    """Compare each line of an executed script with its prediction, in the log's order."""
     rows = []
     for x, step in zip(log, _plan(log, machine).steps, strict=True):
         low, high = step_range(step, machine.timing) or (None, None)
@@ -278,7 +281,7 @@ def against_log(log: Log, machine: Machine) -> list[LogRow]:
 
 
 def unlike(log: Log, machine: Machine) -> tuple[ScriptProblem, ...]:
-    """A warning for each axis of a log that the machine lacks or whose motor has other limits."""
+    """Warn of each axis of a log that the machine lacks or that has other limits there."""
     found: dict[str, ScriptProblem] = {}
     for x in log:
         name, own, what = _axis_of(x.command, machine), x.motor, ""
@@ -296,10 +299,12 @@ def unlike(log: Log, machine: Machine) -> tuple[ScriptProblem, ...]:
 
 
 def _plan(log: Log, machine: Machine) -> Simulation:
+    """Simulate the commands of a log on `machine`, from its home."""
     return simulated(tuple(x.command for x in log), machine, StartState.of(machine))
 
 
 def _replies(logs: Sequence[Log], base: Machine) -> dict[str, tuple[MotorReply, ...]]:
+    """Collect the motors' replies of the logs by axis."""
     found: dict[str, list[MotorReply]] = {}
     for log in logs:
         for x in log:
@@ -317,14 +322,19 @@ def _replies(logs: Sequence[Log], base: Machine) -> dict[str, tuple[MotorReply, 
 
 
 def _axis_of(command: c.Command, machine: Machine) -> str:
-    """The axis of a command, as `machine` writes it."""
+    """Return the axis of a command, as `machine` writes it."""
     return own_name(getattr(command, "component", ""), machine.axes)
 
 
 def _axis(axis: Axis, replies: Sequence[MotorReply], own: Collection[c.Command]) -> Axis:
-    """The axis with the limits and maxima that most replies give.
+    """Fit an axis to replies: its limits and maxima are those that most replies give.
 
     Speed and acceleration are those in force, unless a command in `own` has set them.
+
+    Args:
+        axis: of the base machine.
+        replies: of its motor, oldest first; at least one.
+        own: the commands to this axis.
     """
     most = mode((r.lower, r.upper, r.max_speed, r.max_acceleration) for r in replies)
     agree = [r for r in replies if (r.lower, r.upper, r.max_speed, r.max_acceleration) == most]
@@ -350,6 +360,7 @@ def _axis(axis: Axis, replies: Sequence[MotorReply], own: Collection[c.Command])
 
 
 def _samples(logs: Sequence[Log], machine: Machine) -> dict[str, tuple[float, ...]]:
+    """Collect the time beyond motion, pause and exposures [s] by kind of command."""
     found: dict[str, list[float]] = {}
     for log in logs:
         moved: set[str] = set()
@@ -362,7 +373,7 @@ def _samples(logs: Sequence[Log], machine: Machine) -> dict[str, tuple[float, ..
             since += x.own_s
             took = max(0.0, x.own_s - step.computed_s)
             if isinstance(command, c.WaitXrayReady):
-                kind, took = "xray_ready", since if x.own_s > _AT_ONCE_S else math.nan
+                kind, took = "xray_ready", since if x.own_s > _MAX_READY_WAIT_S else math.nan
             elif isinstance(command, c.XrayOn):
                 since = 0.0
             # Where an axis stood before its first move nobody knows.
@@ -372,6 +383,14 @@ def _samples(logs: Sequence[Log], machine: Machine) -> dict[str, tuple[float, ..
 
 
 def _timing(samples: Mapping[str, Times], before: Timing, source: str, logs: int) -> Timing:
+    """Fit the times of commands: medians, 90 % ranges and the common drift.
+
+    Args:
+        samples: kind of command -> times [s], oldest first.
+        before: times of the base machine.
+        source: names the logs.
+        logs: number of logs.
+    """
     shifts = [fmean(found) for times in samples.values() if (found := _later(times))]
     shift = fmean(shifts) if shifts else 0.0
     unsure = variance(shifts) / len(shifts) if len(shifts) > 1 else 0.0
@@ -389,39 +408,54 @@ def _timing(samples: Mapping[str, Times], before: Timing, source: str, logs: int
     spread = {
         kind: _spread(times, off[kind], common, sure * shift) for kind, times in samples.items()
     }
-    update = {f"{kind}_s": round(x, _DECIMALS) for kind, x in medians.items()}
-    told = {"source": source, "drift": round(math.expm1(abs(shift)), _DECIMALS), "spread": spread}
+    update = {f"{kind}_s": round(x, _TIME_DECIMALS) for kind, x in medians.items()}
+    told = {
+        "source": source,
+        "drift": round(math.expm1(abs(shift)), _TIME_DECIMALS),
+        "spread": spread,
+    }
     return before.model_copy(update={**update, **told})
 
 
 def _log(time: float) -> float:
-    return math.log(time + _FLOOR_S)
+    """Return the logarithm of a time [s], which may be zero."""
+    return math.log(time + _LOG_OFFSET_S)
 
 
 def _later(times: Times) -> list[float]:
-    """Logarithms of the later half of the times over the median of the earlier half, scaled."""
+    """Return the logarithms of the later half's times over the earlier half's median,
+    scaled."""
     half = (len(times) + 1) // 2
     middle, scale = _log(median(times[:half])), math.sqrt(1.0 + 1.0 / half)
     return [(_log(x) - middle) / scale for x in times[half:]]
 
 
 def _spread(times: Times, own: float, common: float, shift: float) -> Spread:
-    """5 % and 95 % of the next time of a kind, with its own and the common scale, and a drift."""
+    """Estimate the 5 % and 95 % quantiles of the next time of a kind.
+
+    Args:
+        times: of the kind [s].
+        own: scale of the kind's logarithms.
+        common: scale of all kinds' logarithms.
+        shift: drift of the logarithms until the next scan.
+    """
     n = len(times)
     scale = (BORROWED_TIMES * common + (n - 1) * own) / (BORROWED_TIMES + n - 1)
-    beyond = scale * max(0.0, -math.log(_TAIL * (n + 1))) * math.sqrt(1.0 + 1.0 / n**2)
-    low, high = np.quantile([_log(x) for x in times], (_TAIL, 1.0 - _TAIL), method="weibull")
+    beyond = scale * max(0.0, -math.log(_TAIL_PROBABILITY * (n + 1))) * math.sqrt(1.0 + 1.0 / n**2)
+    low, high = np.quantile(
+        [_log(x) for x in times], (_TAIL_PROBABILITY, 1.0 - _TAIL_PROBABILITY), method="weibull"
+    )
     low, high = low - beyond + min(0.0, shift), high + beyond + max(0.0, shift)
-    place = 10.0**_DECIMALS
+    place = 10.0**_TIME_DECIMALS
     return Spread(
-        p5_s=math.floor(max(0.0, math.exp(low) - _FLOOR_S) * place) / place,
-        p95_s=min(math.ceil((math.exp(high) - _FLOOR_S) * place) / place, MAX_TIME_S),
+        p5_s=math.floor(max(0.0, math.exp(low) - _LOG_OFFSET_S) * place) / place,
+        p95_s=min(math.ceil((math.exp(high) - _LOG_OFFSET_S) * place) / place, MAX_TIME_S),
         n=n,
     )
 
 
 def _left_out(times: Times) -> list[float]:
-    """For each time the median of the others; itself where it is the only one."""
+    """Return for each time the median of the others; itself if it is the only one."""
     if len(times) == 1:
         return list(times)
     return [median([*times[:i], *times[i + 1 :]]) for i in range(len(times))]

@@ -17,8 +17,9 @@ from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.machine.kinematics import motor_poses
 
-FREE_MM: Final = 60.0
-"""How far beyond the field of view the sample goes for the flat field (assumed: any sample)."""
+BESIDE_BEAM_MM: Final = 60.0
+"""Distance of the sample from the field of view in the flat image [mm] (assumed: any
+sample)."""
 
 
 QUANTITIES: Final = {
@@ -42,11 +43,11 @@ class MotorTargets:
     profile: Profile
 
     def has(self, *quantities: str) -> bool:
-        """Whether motors move all of these."""
+        """Return whether motors move all of these quantities."""
         return all(self.machine.geometry.get(quantity) for quantity in quantities)
 
     def constant(self, quantity: str) -> float:
-        """What a quantity is without its motors [mm]."""
+        """Return the part of a quantity that motors do not change [mm]."""
         p = self.profile
         offsets = {"source_z": p.src_ort, "detector_x": p.det_tan, "detector_y": p.c_det,
                    "object_x": p.axs_tan, "object_y": p.c_obj,
@@ -54,18 +55,18 @@ class MotorTargets:
         return offsets.get(quantity, 0.0) + self.machine.fixed.get(quantity, 0.0)
 
     def at_home(self, quantity: str) -> float:
-        """What a quantity is with every motor at home [mm]."""
+        """Compute a quantity with every motor at home [mm], to six decimals."""
         return round(self.value(quantity, {}), 6)
 
     def value(self, quantity: str, positions: Mapping[str, float]) -> float:
-        """What a quantity is where motors stand at `positions`, the others at home [mm]."""
+        """Compute a quantity with motors at `positions`, the others at home [mm]."""
         factors = self.machine.geometry.get(quantity, {})
         moved = (f * positions.get(n, self.machine.axis(n).home) for n, f in factors.items())
         return self.constant(quantity) + sum(moved)
 
     @cached_property
     def drivers(self) -> dict[str, str]:
-        """Quantity -> the motor that sets it: the one of its motors that moves it most.
+        """Quantity -> the motor that sets it: the free one that moves it most.
 
         No motor sets two quantities. The other motors of a quantity stay at home.
         """
@@ -80,7 +81,11 @@ class MotorTargets:
         return out
 
     def solved(self, wanted: Mapping[str, float]) -> dict[str, float]:
-        """Motors of quantities -> where `drivers` bring them to what is `wanted` [mm], or home."""
+        """Solve for the motors that bring quantities to the `wanted` values [mm].
+
+        Returns:
+            Motor -> position; motors that set none of these quantities are at home.
+        """
         geometry = self.machine.geometry
         moved = (motor for quantity in wanted for motor in geometry.get(quantity, {}))
         out = {motor: self.machine.axis(motor).home for motor in moved}
@@ -91,7 +96,7 @@ class MotorTargets:
         return out
 
     def driver(self, quantity: str) -> str:
-        """The motor that sets a quantity.
+        """Return the motor that sets a quantity.
 
         Raises:
             LimitError: no motor is left for it.
@@ -112,7 +117,7 @@ class MotorTargets:
             raise self.lacking(none, asked=what, missing=quantity)
 
     def lacking(self, what: str, **data: object) -> LimitError:
-        """The error that says what this machine lacks."""
+        """Make the error that says what this machine lacks."""
         return LimitError(f"{self.machine.name} {what}", data)
 
     @property
@@ -128,7 +133,7 @@ def beside_beam(
     positions: Mapping[str, float],
     radius_mm: float = 0.0,
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Where the sample's stage goes from `positions` so that the beam is free, as far as it can.
+    """Find the targets that take the sample out of the beam, as far as its stage can.
 
     Args:
         machine: whose motors these are.
@@ -157,7 +162,7 @@ def beside_beam(
     off = float((share * beam - sample)[2 * k])
     middle = positions.get(name, axis.home) + off / factor
     size = camera.shape[1 - k] * camera.pixels_mm(machine.detector.pixels)[k]
-    away = (abs(share) * size / 2 + FREE_MM + radius_mm) / abs(factor)
+    away = (abs(share) * size / 2 + BESIDE_BEAM_MM + radius_mm) / abs(factor)
     least, most = math.ceil(axis.lower * 1e6) / 1e6, math.floor(axis.upper * 1e6) / 1e6
     upper, lower = ({name: round(min(max(middle + way, least), most), 6)} for way in (away, -away))
     freer = middle - axis.lower > axis.upper - middle

@@ -26,9 +26,9 @@ from flexdt.twin.script.problems import ScriptError, ScriptProblem, in_order
 from flexdt.twin.signatures import PathLike
 
 LIGHT_BYTES: Final = 8 << 10
-"""A script or list of poses up to this size may be planned in a thread."""
-_HEAVY = re.compile(rb"(?<!\d)[1-9]\d{4}|\d[eE]\+?\d")
-"""Numbers in a light script that may mean a million images."""
+"""Longest script, or list of poses, that any thread may plan [bytes]."""
+_MANY_IMAGES = re.compile(rb"(?<!\d)[1-9]\d{4}|\d[eE]\+?\d")
+"""Numbers in a short script that may mean a million images."""
 
 LOG_STAMP: Final = re.compile(rb"\t(\d\d):(\d\d):(\d\d\.\d{3})[ \t]*(?:\r\n|\n|\r|\Z)")
 """The end of a line of an executed script: the moment at which its command was sent."""
@@ -41,8 +41,8 @@ _TAIL_COMMENT = re.compile(r"(?<!\S)(?:#|//|;).*$", re.DOTALL)
 """A comment that starts a word: `# ...`, `// ...` or `; ...`."""
 _WORD = re.compile(r"\S+")
 _BLANK = " \t\ufeff\x1a"
-_MAX_JOINED = 64
-"""Lines that one binary argument may span; a real one is about a hundred bytes."""
+_MAX_BLOB_LINES = 64
+"""Largest number of lines in one binary argument; a real one is about a hundred bytes."""
 _COMMENT_MARKS = ("#", "//", ";")
 _CUSTOM_NAME = re.compile(r"[A-Za-z][\w$.-]*", re.ASCII)
 Source = str | bytes | PathLike
@@ -72,18 +72,19 @@ class CodeLine:
     columns: tuple[Field, ...] | None
 
     def words(self, start: int = 0) -> tuple[Field, ...]:
-        """The words of the line from character `start` on."""
+        """Split the line into words, from character `start` on."""
         return tuple(Field(m[0], m.start() + 1) for m in _WORD.finditer(self.text, start))
 
 
 def decode(data: str | bytes) -> str:
-    """Text of a script; bytes that are not UTF-8 become lone surrogates (`encode` undoes it)."""
+    """Decode a script's bytes; those that are not UTF-8 become lone surrogates (`encode`
+    undoes it)."""
     text = data.decode("utf-8", "surrogateescape") if isinstance(data, bytes) else data
     return text.removeprefix("\ufeff")
 
 
 def is_utf16(data: str | bytes) -> bool:
-    """Whether the text was saved in two bytes a character, which no scanner writes."""
+    """Return whether the text was saved in two bytes a character, which no scanner does."""
     head = data[:40] if isinstance(data, bytes) else data[:40].encode("utf-8", "surrogatepass")
     return head[:2] in (b"\xff\xfe", b"\xfe\xff") or (
         len(head) >= 4 and not (any(head[0::2]) and any(head[1::2]))
@@ -91,19 +92,19 @@ def is_utf16(data: str | bytes) -> bool:
 
 
 def is_log(text: str | bytes) -> bool:
-    """Whether a text is an executed script: some line ends with a moment after a TAB.
+    r"""Return whether a text is an executed script: some line ends with a moment after a TAB.
 
     Example:
-        >>> is_log("tube\\txrayoff\\t\\t\\tACK")
+        >>> is_log("tube\txrayoff\t\t\tACK")
         False
-        >>> is_log("tube\\txrayoff\\t\\t\\tACK\\t\\t\\t501\\t\\t09:36:31.952")
+        >>> is_log("tube\txrayoff\t\t\tACK\t\t\t501\t\t09:36:31.952")
         True
     """
     return LOG_STAMP.search(grammar.encode(text) if isinstance(text, str) else text) is not None
 
 
 def rows(data: str | bytes) -> Iterator[CodeLine]:
-    """The rows of a script, blank lines and comment lines left out."""
+    """Yield the rows of a script without blank lines and comment lines."""
     for number, text in _lines(decode(data)):
         if _BLOB.match(text) and "\t" in text:
             yield CodeLine(number, text, _blob_columns(text))
@@ -112,13 +113,13 @@ def rows(data: str | bytes) -> Iterator[CodeLine]:
 
 
 def line_count(data: str | bytes) -> int:
-    """Number of lines of a script."""
+    """Count the lines of a script."""
     text = decode(data)
     return len(_END.findall(text)) + (not text.endswith(("\n", "\r")) and bool(text))
 
 
 def _lines(text: str) -> Iterator[tuple[int, str]]:
-    """(number, line); a binary argument that holds line ends stays in one piece."""
+    """Yield (number, line); a binary argument that holds line ends stays in one piece."""
     parts = _END.split(text)
     ends = _END.findall(text)
     crlf = "\r\n" in ends
@@ -133,14 +134,23 @@ def _lines(text: str) -> Iterator[tuple[int, str]]:
 
 
 def _blob_end(parts: list[str], ends: list[str], first: int, crlf: bool) -> int:
-    """Index of the part that ends the binary argument begun in part `first`.
+    """Find the part that ends the binary argument begun in part `first`.
 
-    It ends where a line ends with a wait column. Only in a file without CRLF, or where the line
-    end is a lone CR or LF, can an end of line be part of the data for sure; so in a file with
-    CRLF the search stops at the first CRLF.
+    It ends where a line ends with a wait column. Only in a file without CRLF, or where
+    the line end is a lone CR or LF, can an end of line be part of the data for sure; so
+    in a file with CRLF the search stops at the first CRLF.
+
+    Args:
+        parts: pieces of the text between line ends.
+        ends: the line end behind each piece.
+        first: index of the piece in which the argument begins.
+        crlf: whether the file has CRLF line ends.
+
+    Returns:
+        Index of a piece; `first` if no end is found.
     """
     joined = ""
-    for i in range(first, min(first + _MAX_JOINED, len(parts))):
+    for i in range(first, min(first + _MAX_BLOB_LINES, len(parts))):
         joined += parts[i]
         if _BLOB_WAIT.search(joined) and (not crlf or i >= len(ends) or ends[i] == "\r\n"):
             return i
@@ -151,6 +161,7 @@ def _blob_end(parts: list[str], ends: list[str], first: int, crlf: bool) -> int:
 
 
 def _columns(text: str) -> tuple[Field, ...]:
+    """Split a row at TABs and drop a comment in its last columns."""
     fields: list[Field] = []
     start = 0
     for i, piece in enumerate(text.split("\t")):
@@ -165,7 +176,7 @@ def _columns(text: str) -> tuple[Field, ...]:
 
 
 def _blob_columns(text: str) -> tuple[Field, ...]:
-    """Columns of a `set sample info` line: its last four columns are found from the right."""
+    """Split a `set sample info` row; its last four columns are found from the right."""
     pieces = text.split("\t")
     tail = next(
         (k for k in range(len(pieces) - 1, 3, -1) if _BLOB_WAIT.fullmatch("\t" + pieces[k])), None
@@ -182,6 +193,8 @@ def _blob_columns(text: str) -> tuple[Field, ...]:
 
 
 def _field(piece: str, start: int, *, keep: bool = False) -> Field:
+    """Make a field with blanks stripped, unless `keep`; `start` is the index of its first
+    character."""
     if keep or not piece:
         return Field(piece, start + 1)
     stripped = piece.strip(_BLANK)
@@ -190,8 +203,8 @@ def _field(piece: str, start: int, *, keep: bool = False) -> Field:
 
 
 def is_light(script: bytes) -> bool:
-    """Whether planning a script takes so little time that any thread may do it at once."""
-    return len(script) <= LIGHT_BYTES and _HEAVY.search(script) is None
+    """Return whether a script is planned so fast that any thread may do it."""
+    return len(script) <= LIGHT_BYTES and _MANY_IMAGES.search(script) is None
 
 
 def parse_script(text: Source) -> c.Script:
@@ -215,10 +228,10 @@ def parse_script(text: Source) -> c.Script:
 
 
 def read_script(text: Source) -> tuple[c.Script, tuple[ScriptProblem, ...]]:
-    """The commands that could be read, and every problem of the text, by line.
+    r"""Read the commands of a script and every problem of its text, in line order.
 
     Example:
-        >>> script, problems = read_script("camera\\tset exposure\\tlong\\t\\tACK\\t\\t\\r\\n")
+        >>> script, problems = read_script("camera\tset exposure\tlong\t\tACK\t\t\r\n")
         >>> [(problem.line, problem.column) for problem in problems]
         [(1, 21)]
     """
@@ -246,12 +259,13 @@ def read_script(text: Source) -> tuple[c.Script, tuple[ScriptProblem, ...]]:
 
 
 def read_row(row: CodeLine, problems: list[ScriptProblem]) -> c.Command | None:
-    """The command of one row, or None; what is wrong with it is added to `problems`."""
+    """Read the command of one row; add its problems to `problems` and return None after
+    an error."""
     return _Line(row, problems).command()
 
 
 def content(text: Source) -> str | bytes:
-    """The text or bytes of a script; those of the file where a path is given."""
+    """Return the text or bytes of a script, read from its file if a path is given."""
     if isinstance(text, str | bytes):
         return text
     read: bytes = backend("scripts").read(text)
@@ -287,12 +301,15 @@ class _Line:
         self.end = Field("", len(row.text) + 1)
 
     def error(self, code: str, column: int, message: str) -> None:
+        """Add an error about this line."""
         self.problems.append(ScriptProblem("error", code, self.row.line, column, message))
 
     def warn(self, code: str, column: int, message: str) -> None:
+        """Add a warning about this line."""
         self.problems.append(ScriptProblem("warning", code, self.row.line, column, message))
 
     def command(self) -> c.Command | None:
+        """Read the command; None if an error was added."""
         try:
             if not self.component.text:
                 raise _Refused("syntax", 1, "the component (first column) is missing")
@@ -303,6 +320,7 @@ class _Line:
             return None
 
     def _tabbed(self, columns: tuple[Field, ...]) -> _Parts | None:
+        """Divide a row of TAB separated columns; None for an unknown command."""
         verb = columns[1] if len(columns) > 1 else self.end
         spec = grammar.find(self.component.text, verb.text) if verb.text else None
         if spec is None:  # a multi-word command may be split over columns here too
@@ -318,6 +336,7 @@ class _Line:
         return _Parts(spec, *rest[:5])
 
     def _padded(self) -> _Parts | None:
+        """Divide a row padded with spaces; None for an unknown command."""
         words = self.row.words()
         found = grammar.match(self.component.text, [w.text for w in words[1:6]])
         if found is None:
@@ -339,6 +358,7 @@ class _Line:
         return _Parts(spec, first, second, wait, timeout, expected)
 
     def _arguments(self, spec: Spec, body: Sequence[Field]) -> tuple[Field, Field]:
+        """Divide the words between command and wait into two arguments."""
         none = Field("", body[0].column if body else len(self.row.text) + 1)
         if not body:
             return none, none
@@ -355,11 +375,13 @@ class _Line:
         return body[0], body[1] if len(body) > 1 else none
 
     def _span(self, body: Sequence[Field]) -> Field:
+        """Join words into one field, with the blanks between them."""
         start = body[0].column
         last = body[-1]
         return Field(self.row.text[start - 1 : last.column - 1 + len(last.text)], start)
 
     def _unknown(self) -> c.Command:
+        """Read a row as a custom command with a warning, or refuse it with a suggestion."""
         name = self.component.text
         fields = [f for f in (self.row.columns or self.row.words())[1:] if f.text]
         if name.lower() in grammar.FIXED or grammar.is_reserved(name):
@@ -385,9 +407,9 @@ class _Line:
         )
 
     def _custom_form(self, fields: Sequence[Field]) -> bool:
-        """Whether the line can be for a component that the user added to the scanner.
+        """Return whether the line can be for a component that the user added to the scanner.
 
-        A near miss of a name of the scanner's own with a command of its own is a slip.
+        A near miss of one of the scanner's own names with a command of its own is a slip.
         """
         name = self.component.text
         if len(fields) < 2 or _CUSTOM_NAME.fullmatch(name) is None:
@@ -399,6 +421,7 @@ class _Line:
         return any(_find_wait(_split(f), 0)[1] for f in fields) or bool(_find_wait(fields, 0)[1])
 
     def _build(self, parts: _Parts) -> c.Command | None:
+        """Read arguments, wait and times into a command; None if an error was added."""
         before = len(self.problems)
         fields: dict[str, object] = {"line": self.row.line, "column": self.component.column}
         if issubclass(parts.spec.type, c.MotorCommand):
@@ -424,6 +447,7 @@ class _Line:
         return parts.spec.type(**fields)  # type: ignore[arg-type]
 
     def _wait(self, parts: _Parts) -> c.Wait:
+        """Read the wait, or assume it with a warning; check it against the trigger position."""
         is_move = parts.spec.type is c.MoveAbsolute
         text, column, trigger = parts.wait.text, parts.wait.column, parts.second
         if not text:
@@ -448,16 +472,18 @@ class _Line:
 
 
 def _is_comment(word: Field) -> bool:
+    """Return whether a word begins a comment."""
     return word.text.startswith(_COMMENT_MARKS)
 
 
 def _until_comment(words: Sequence[Field]) -> list[Field]:
+    """Return the words before the first comment."""
     cut = next((i for i, w in enumerate(words) if _is_comment(w)), len(words))
     return list(words[:cut])
 
 
 def _find_wait(words: Sequence[Field], start: int) -> tuple[int, int]:
-    """(index, words) of the wait: the first that only numbers or a comment follow."""
+    """Find the first wait that only numbers or a comment follow, as (index, words)."""
     for i in range(start, len(words)):
         text = words[i].text.lower()
         width = 1 if text in ("ack", "pos", "rcv") else 0
@@ -473,9 +499,11 @@ def _find_wait(words: Sequence[Field], start: int) -> tuple[int, int]:
 
 
 def _split(field: Field) -> list[Field]:
+    """Split a field into words."""
     return [Field(text, field.column) for text in field.text.split()]
 
 
 def _meant(asked: str, allowed: Sequence[str]) -> str:
+    """Suggest the nearest allowed name, or return ""."""
     near = nearest_name(asked, allowed)
     return "" if near is None else f" (did you mean {near!r}?)"

@@ -26,12 +26,12 @@ class ScriptProblem:
     message: str
 
     def to_dict(self) -> dict[str, object]:
-        """The JSON form of `flexdt check`."""
+        """Return the JSON form of `flexdt check`."""
         return asdict(self)
 
     @property
     def where_and_what(self) -> str:
-        """For a reader who knows the severity already."""
+        """Line, column and message, without the severity."""
         return f"line {self.line}, column {self.column}: {self.message}"
 
     def __str__(self) -> str:
@@ -39,7 +39,7 @@ class ScriptProblem:
 
 
 class WithProblems:
-    """What has `problems`: the errors among them, and the warnings."""
+    """Base of values that have `problems`: the errors and the warnings among them."""
 
     problems: tuple[ScriptProblem, ...]
 
@@ -50,7 +50,7 @@ class WithProblems:
 
     @property
     def warnings(self) -> tuple[ScriptProblem, ...]:
-        """Problems that do not."""
+        """Problems that do not forbid running the script."""
         return tuple(p for p in self.problems if p.severity == "warning")
 
 
@@ -83,5 +83,5 @@ class Findings:
 
 
 def in_order(problems: Iterable[ScriptProblem]) -> tuple[ScriptProblem, ...]:
-    """Problems by line and column; those of one place keep their order."""
+    """Sort problems by line and column; those of one place keep their order."""
     return tuple(sorted(problems, key=lambda p: (p.line, p.column)))

@@ -12,7 +12,7 @@ Kind = Literal["fly", "step", "tiled", "helical", "calibration"]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 
 REFERENCES: Final = 10
-"""Images averaged for a dark and a flat: their noise is then little beside a projection's."""
+"""Images averaged for a dark and a flat; their noise is then small beside a projection's."""
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,8 @@ from flexdt.twin.script.problems import ScriptProblem
 
 BoolArray = npt.NDArray[np.bool_]
 
-_PROBES = 33
-"""Images of one sequence that are looked at; the way between them is smooth."""
+_SAMPLED_IMAGES = 33
+"""Images of one sequence that are examined; positions between them are smooth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,18 +70,20 @@ class View:
 
 
 def _beyond(low: FloatArray, high: FloatArray, size: int) -> FloatArray:
+    """Compute how far a projection reaches beyond the image's low and high edge [pixels],
+    (n, 2)."""
     return np.maximum(np.stack([-0.5 - low, high - (size - 0.5)], axis=1), 0.0)
 
 
 def views(plan: ScanPlan) -> Iterator[View]:
-    """The saved images of `plan` by camera setting and kind; long sequences are sampled."""
+    """Group the saved images of `plan` by camera setting and kind; sample long sequences."""
     batches: dict[tuple[CameraSettings, ImageKind], tuple[list[int], list[int]]] = {}
     first = 0
     for g in plan.groups:
         if g.files and min(g.camera.shape) > 0:
             camera = replace(g.camera, frames=1, averages=1, exposure_ms=1.0)
             index, lines = batches.setdefault((camera, g.kind), ([], []))
-            count = min(len(g), _PROBES) if g.moving else 1
+            count = min(len(g), _SAMPLED_IMAGES) if g.moving else 1
             probes = np.linspace(0, len(g) - 1, count).round().astype(int).tolist()
             index += [first + i for i in probes]
             lines += [g.line] * len(probes)
@@ -92,7 +94,7 @@ def views(plan: ScanPlan) -> Iterator[View]:
 
 
 def beam_problems(plan: ScanPlan) -> tuple[ScriptProblem, ...]:
-    """Warnings: the sample outside the beam in projections, or inside it in flats."""
+    """Warn of projections with the sample outside the beam, and of flats with it inside."""
     found: list[ScriptProblem] = []
     for view in views(plan):
         outside = view.outside
@@ -104,12 +106,14 @@ def beam_problems(plan: ScanPlan) -> tuple[ScriptProblem, ...]:
 
 
 def _aggregate(view: View, bad: BoolArray, code: str, text: str) -> ScriptProblem:
+    """Make one warning for all images of a view that are `bad`."""
     lines = sorted({line for line, b in zip(view.lines, bad.tolist(), strict=True) if b})
     more = f" (and at {len(lines) - 1} more lines)" if len(lines) > 1 else ""
     return ScriptProblem("warning", code, lines[0], 1, text + more)
 
 
 def _outside_text(view: View) -> str:
+    """Describe the first image that shows no sample."""
     i = int(np.argmax(view.outside))
     rows, cols = view.camera.shape
     side, sides = "above or below", f"rows 0 to {rows - 1}"
@@ -123,6 +127,7 @@ def _outside_text(view: View) -> str:
 
 
 def _inside_text(view: View) -> str:
+    """Describe the first flat image that shows the sample."""
     i = int(np.argmin(view.outside))
     if view.left[i] == view.right[i]:
         where = f"the shadow of its axis lies at column {view.axis[i]:.0f}"
@@ -138,6 +143,7 @@ def _view(
     lines: tuple[int, ...],
     positions: dict[str, FloatArray],
 ) -> View:
+    """Project the sample's outline into the images of one camera setting."""
     p = motor_poses(plan.machine, plan.profile, camera, positions)
     shape = camera.shape
     axis = _project(p, p.axis, shape)[:, 0]
@@ -155,7 +161,8 @@ def _view(
 
 
 def _tangents(p: Poses, radius: float) -> list[FloatArray]:
-    """Points where the rays that just touch the cylinder do so, at the source's height."""
+    """Compute the points where rays touch the cylinder, at the source's height, two of
+    (n, 3) [mm]."""
     to_source = p.source - p.axis
     flat = to_source[:, :2]
     distance = np.linalg.norm(flat, axis=1, keepdims=True)
@@ -168,7 +175,8 @@ def _tangents(p: Poses, radius: float) -> list[FloatArray]:
 
 
 def _rims(p: Poses, radius: float, half_height: float) -> list[FloatArray]:
-    """Nearest and farthest points of the cylinder's two rims."""
+    """Compute the nearest and farthest points of the cylinder's two rims, four of (n, 3)
+    [mm]."""
     along = (p.source - p.axis)[:, :2]
     along = along / np.linalg.norm(along, axis=1, keepdims=True)
     return [
@@ -179,6 +187,6 @@ def _rims(p: Poses, radius: float, half_height: float) -> list[FloatArray]:
 
 
 def _project(p: Poses, points: FloatArray, shape: tuple[int, int]) -> FloatArray:
-    """One world point for each pose to (n, 2) pixels."""
+    """Project one world point (n, 3) for each pose to (n, 2) pixels."""
     moved = ConeVec.from_vectors(p.source - points, p.detector - points, p.u, p.v)
     return moved.project_points(np.zeros((1, 3)), shape)[:, 0, :]

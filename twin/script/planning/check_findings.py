@@ -9,19 +9,21 @@ from typing import Final
 Trace = tuple[tuple[float, float], ...]
 
 
-PIXELS: Final = {"left": "columns", "right": "columns", "top": "rows", "bottom": "rows"}
-"""Side of an image -> what is cut off there."""
-LEAST_PX: Final = 0.5
-"""From which on something is cut off."""
+CUT_AT_SIDE: Final = {"left": "columns", "right": "columns", "top": "rows", "bottom": "rows"}
+"""Side of an image -> whether columns or rows are cut off there."""
+MIN_CUT_PX: Final = 0.5
+"""Truncation above this is reported [px]."""
 
 
 def cut_off(sides: Mapping[str, float]) -> str:
-    """How far the sample is cut off, in words; "" where it is not.
+    """Describe how far the sample is cut off; "" if it is not.
 
     Args:
         sides: left, right, top, bottom -> pixels.
     """
-    return ", ".join(f"{s} by {px:.0f} {PIXELS[s]}" for s, px in sides.items() if px > LEAST_PX)
+    return ", ".join(
+        f"{s} by {px:.0f} {CUT_AT_SIDE[s]}" for s, px in sides.items() if px > MIN_CUT_PX
+    )
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class Collision:
     last_free: Mapping[str, float]
 
     def to_dict(self) -> dict[str, object]:
-        """The JSON form of `flexdt check`."""
+        """Return the JSON form of `flexdt check`."""
         return {**vars(self), "pair": list(self.pair), "last_free": dict(self.last_free)}
 
 
@@ -84,7 +86,7 @@ class Optics:
         return self.truncation is not None and any(x > 0 for x in self.truncation.values())
 
     def to_dict(self) -> dict[str, object]:
-        """JSON form."""
+        """Return the JSON form."""
         names = {"field_mm": "field_of_view_mm", "turn_field_mm": "full_turn_diameter_mm",
                  "truncation": "truncation_px"}  # fmt: skip
         told = {n: list(v) if isinstance(v, tuple) else v for n, v in vars(self).items()}

@@ -22,8 +22,8 @@ from flexdt.twin.script.commands import ImageKind
 from flexdt.twin.script.planning.plan import ScanPlan
 from flexdt.twin.script.problems import ScriptProblem
 
-PROBES = 5
-"""Images of one setting whose distances are looked at."""
+SAMPLED_IMAGES = 5
+"""Images of one setting whose distances are examined."""
 OPEN_BEAM_CODES: Final = ("saturated_open_beam", "starved_open_beam")
 """Codes of the warnings of `open_beam_problems`."""
 Setting = tuple[ExposureSettings, CameraSettings]
@@ -93,8 +93,8 @@ def brightest_beam(
 
 
 def _views(plan: ScanPlan, camera: CameraSettings, indices: list[int]) -> Iterator[FloatArray]:
-    """Give cone_vec rows (12,) of some images."""
-    chosen = np.unique(np.linspace(0, len(indices) - 1, PROBES).astype(int))
+    """Yield cone_vec rows (12,) of some images."""
+    chosen = np.unique(np.linspace(0, len(indices) - 1, SAMPLED_IMAGES).astype(int))
     index = [indices[i] for i in chosen]
     positions = {name: x[index] for name, x in plan.image_positions.items()}
     yield from motor_poses(plan.machine, plan.profile, camera, positions).cone_vec().rows

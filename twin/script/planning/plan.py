@@ -121,10 +121,11 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
         return self.poses.cone_vec().with_shape(shapes.pop() if len(shapes) == 1 else None)
 
     def check(self, sample: object = None) -> CheckReport:
-        """Problems, collisions, clearances, truncation and dose, as `flexdt check` reports them.
+        """Check the plan: problems, collisions, truncation and dose, as `flexdt check` does.
 
         Args:
-            sample: what stands on the stage, as `flexdt.plan` takes it; None: what the script says.
+            sample: what stands on the stage, as `flexdt.plan` takes it; None: what the
+                script says.
 
         Returns:
             `ok` is False with an error or a collision, and
@@ -134,7 +135,7 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
         return report
 
     def plot(self, report: CheckReport | None = None) -> Any:
-        """Motors, X-rays, exposures and clearance over time; needs matplotlib (the extra `plots`).
+        """Plot motors, X-rays, exposures and clearance over time (needs the extra `plots`).
 
         Args:
             report: from `check`; None checks now.
@@ -153,7 +154,7 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
         }
 
     def positions(self, times: npt.ArrayLike) -> dict[str, FloatArray]:
-        """Axis -> positions at `times` [s], same shape."""
+        """Compute axis -> positions at `times` [s], of the same shape."""
         return {axis: path.positions(times) for axis, path in self.paths.items()}
 
     @cached_property
@@ -173,10 +174,11 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
         return out
 
     def subframe_positions(self, samples: int) -> dict[str, FloatArray]:
-        """Axis -> (n, samples) positions spread over each image's exposure.
+        """Compute axis -> (n, samples) positions spread over each image's exposure.
 
-        The samples lie symmetrically about the nominal pose (assumed: no public source says where
-        in the exposure the trigger falls), so their mean has no bias against it.
+        The samples lie symmetrically about the nominal pose (assumed: no public source
+        says where in the exposure the trigger falls), so their mean has no bias against
+        it.
         """
         offsets = (np.arange(samples) + 0.5) / samples - 0.5
         of_group = [g.camera.exposure_ms * g.camera.averages / 1000.0 * g.moving
@@ -210,7 +212,7 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
 
 
 def saved_images(plan: ScanPlan) -> Iterator[tuple[ExposureGroup, dict[str, FloatArray]]]:
-    """Images of a plan that are saved, group by group, with the motors' positions."""
+    """Yield the groups of saved images with the motors' positions, axis -> (n,)."""
     first = 0
     for group in plan.groups:
         rows = slice(first, first + len(group))
@@ -241,7 +243,7 @@ class CheckReport(WithProblems):
 
     @property
     def ok(self) -> bool:
-        """No error and no collision; warnings do not count."""
+        """Whether there is no error and no collision; warnings do not count."""
         return not self.errors  # a collision is one
 
     @property
@@ -260,7 +262,7 @@ class CheckReport(WithProblems):
         return f"{size.diameter_mm:g} mm across{high} ({size.source})"
 
     def to_dict(self) -> dict[str, object]:
-        """The JSON document."""
+        """Return the JSON document of `flexdt check --json`."""
         plan, clearance = self.plan, self.clearance
         size, found = plan.sample, clearance or Clearance()
         return {
@@ -294,5 +296,6 @@ class CheckReport(WithProblems):
 
 
 def _range(found: Range | None) -> dict[str, float | None]:
+    """Return a 90 % range as {p5_s, p95_s}."""
     low, high = found or (None, None)
     return {"p5_s": low, "p95_s": high}

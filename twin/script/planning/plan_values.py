@@ -28,7 +28,7 @@ class StartState:
 
     @classmethod
     def of(cls, machine: Machine) -> StartState:
-        """The machine's homes and defaults; whether X-rays are on is not known."""
+        """Make the state of a machine at home with its defaults; X-rays are unknown."""
         return cls(
             {n: a.home for n, a in machine.axes.items()},
             {n: a.speed for n, a in machine.axes.items()},
@@ -171,7 +171,8 @@ class SampleSize:
     def around(
         cls, size_mm: Sequence[float], source: str = "given", offset: StagePlacement | None = None
     ) -> SampleSize:
-        """The cylinder that contains a box of `size_mm` (x, y, z) at `offset`, at every angle."""
+        """Make the cylinder that contains a box of `size_mm` (x, y, z) at `offset`, at
+        every angle."""
         at = StagePlacement() if offset is None else offset
         x, y, z = size_mm
         radius = 0.5 * math.hypot(x, y)

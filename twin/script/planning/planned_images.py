@@ -28,17 +28,26 @@ from flexdt.twin.script.problems import Findings
 
 MARGIN_IMAGES: Final = 4.0
 """Images' worth of constant speed before the first and after the last image."""
-FULL_TURN: Final = 360.0
-MAX_STEPS: Final = 1_000_000
-"""More than this is no inference but a mistake."""
-_TIME_EPS = 1e-9
-_POSITION_EPS = 1e-7
+FULL_TURN_DEG: Final = 360.0
+MAX_INFERRED_STEPS: Final = 1_000_000
+"""Largest number of steps that is inferred; more is a mistake in the script."""
+_TIME_TOLERANCE_S = 1e-9
+_POSITION_TOLERANCE = 1e-7
 _MISMATCH_STEPS = 0.05
-"""Steps by which stated frames may miss a whole turn before it is worth a warning."""
+"""Steps by which stated frames may miss a whole turn without a warning."""
 
 
 def run_up(speed: float, acceleration: float, period_s: float) -> float:
-    """Length before the first image: speeding up, then four images at constant speed."""
+    """Compute the length before the first image: speeding up, then four images.
+
+    Args:
+        speed: of the scan [unit/s].
+        acceleration: of the axis [unit/s2].
+        period_s: exposure time of an image, averages included [s].
+
+    Returns:
+        Length [unit], deg or mm as the axis has.
+    """
     return speed * speed / (2.0 * acceleration) + MARGIN_IMAGES * period_s * speed
 
 
@@ -57,13 +66,22 @@ class Inference:
 def infer(
     trigger: planned.Trigger, exposure_s: float, frames: int | None, averages: int | None
 ) -> Inference | None:
-    """Averages, then frames, then the increment; None if speed and run-up do not tell.
+    """Infer averages, then frames, then the increment from speed and run-up.
 
-    The scan's length is the motion's less one run-up at each end (the end is symmetric), rounded
-    to whole turns for a rotation. Averages follow from frames where those are stated, else from
-    the run-up. `frames x speed x period` within half a step of whole turns means that the images
-    lie at turn / (frames - 1), as the scanner's own software counts; otherwise they lie where the
-    motor is.
+    The scan's length is the motion's less one run-up at each end (the end is symmetric),
+    rounded to whole turns for a rotation. Averages follow from frames where those are
+    stated, else from the run-up. `frames x speed x period` within half a step of whole
+    turns means that the images lie at turn / (frames - 1), as the scanner's own software
+    counts; otherwise they lie where the motor is.
+
+    Args:
+        trigger: the move that waited for a position.
+        exposure_s: of one image [s].
+        frames: stated number of frames, or None.
+        averages: stated number of averages, or None.
+
+    Returns:
+        The inferred values, or None if speed and run-up do not determine them.
     """
     length, rotation = _length(trigger), trigger.unit == "deg"
     notes: dict[str, str] = {}
@@ -75,7 +93,7 @@ def infer(
     step = trigger.speed * exposure_s * averages
     if frames is None:
         steps = length / step
-        if not 0.5 <= steps < MAX_STEPS:
+        if not 0.5 <= steps < MAX_INFERRED_STEPS:
             return None
         frames = round(steps) + 1
         notes["frames"] = (
@@ -87,25 +105,28 @@ def infer(
 
 
 def images(step: float, frames: int, rotation: bool) -> tuple[float, float]:
-    """(increment, mismatch over the scan) for `frames` images with `step` of motion between."""
+    """Compute (increment, mismatch over the scan) of `frames` images with `step` of
+    motion between."""
     scan = step * (frames - 1)
-    turns = round(scan / FULL_TURN)
-    if rotation and turns >= 1 and abs(scan - turns * FULL_TURN) < 0.5 * step:
-        return turns * FULL_TURN / (frames - 1), scan - turns * FULL_TURN
+    turns = round(scan / FULL_TURN_DEG)
+    if rotation and turns >= 1 and abs(scan - turns * FULL_TURN_DEG) < 0.5 * step:
+        return turns * FULL_TURN_DEG / (frames - 1), scan - turns * FULL_TURN_DEG
     return step, 0.0
 
 
 def _length(trigger: planned.Trigger) -> float:
+    """Compute the length of a scan without its run-ups, rounded to whole turns."""
     length = abs(trigger.trajectory.target - trigger.position) - trigger.run_up
-    turns = round(length / FULL_TURN)
-    if trigger.unit == "deg" and turns >= 1 and abs(length - turns * FULL_TURN) < 1.0:
-        return turns * FULL_TURN
+    turns = round(length / FULL_TURN_DEG)
+    if trigger.unit == "deg" and turns >= 1 and abs(length - turns * FULL_TURN_DEG) < 1.0:
+        return turns * FULL_TURN_DEG
     return length
 
 
 def _averages(
     trigger: planned.Trigger, exposure_s: float, frames: int | None, length: float
 ) -> tuple[int, str] | None:
+    """Infer averages, and how; None if they are not a whole number within 2 %."""
     speed, acceleration = trigger.speed, trigger.acceleration
     if frames is not None and frames > 1 and length > 0.0:
         period = length / (frames - 1) / speed
@@ -121,7 +142,13 @@ def _averages(
 
 
 class ImageCollector:
-    """Collects images; lives only while a plan is made."""
+    """Collects the images of a script; lives only while a plan is made.
+
+    Args:
+        machine, motors, tube, camera: the simulated scanner.
+        findings: takes problems.
+        averages: inferred in a first run, for images before the scan; None: not known.
+    """
 
     def __init__(
         self,
@@ -147,20 +174,20 @@ class ImageCollector:
             camera.assume("averages", averages)
 
     def groups(self) -> tuple[ExposureGroup, ...]:
-        """All images, in the order in which they were taken."""
+        """Return all images, in the order in which they were taken."""
         return tuple(self.images)
 
     # commands ------------------------------------------------------------------------------
 
     def take(self, command: c.TakeImage, now: float, step: int) -> planned.Span:
-        """`take image`: one image; the number of frames is for sequences."""
+        """Simulate `take image`: one image; the number of frames is for sequences."""
         self._taken(np.array([now], dtype=np.float64), now, step, command.line)
         settings = self.camera.settings
         length = settings.exposure_ms * settings.averages / 1000.0
         return self._busy(now, length, "take_image_overhead")
 
     def save(self, command: c.SaveImage, now: float, _step: int) -> planned.Span:
-        """`save image`: gives the image taken last its name, and with it its kind."""
+        """Simulate `save image`: name the last image, which determines its kind."""
         name = image_name(command.path)
         if name is None:
             self.findings.error("path", f"{shorten(command.path)!r} does not end with a file name")
@@ -180,7 +207,7 @@ class ImageCollector:
         return self._busy(now, 0.0, "save_image")
 
     def sequence(self, command: c.TakeSequence, start: float, step: int) -> planned.Span:
-        """`take and save image sequence`: back to back, over whatever moves meanwhile."""
+        """Simulate `take and save image sequence`: back to back, during any motion."""
         trigger = self._active(start)
         moving = self.motors.moving(start)
         inference = self._infer(trigger, start)
@@ -209,6 +236,7 @@ class ImageCollector:
     # time ----------------------------------------------------------------------------------
 
     def _busy(self, start: float, length: float, kind: str) -> planned.Span:
+        """Keep the camera busy for `length` [s] and the overhead of `kind`."""
         overhead = self.machine.timing.seconds(kind)
         end = start + length + overhead
         self.camera.free_at = end
@@ -224,7 +252,8 @@ class ImageCollector:
         files: tuple[str, ...] = (),
         exact: Mapping[str, FloatArray] | None = None,
     ) -> ExposureGroup:
-        """Images from `start` on, with the settings in force; they are the last ones then."""
+        """Add images taken from `start` on with the settings in force; make them the last
+        ones."""
         tube, self.moved = self.tube, self.motors.moving(start)
         lit, moving = tube.lit(start), bool(self.moved)
         made = ExposureGroup(
@@ -238,7 +267,7 @@ class ImageCollector:
     # fly scans -----------------------------------------------------------------------------
 
     def _active(self, start: float) -> planned.Trigger | None:
-        """The trigger whose motion is still under way, if any."""
+        """Return the trigger whose motion is still under way at `start`, or None."""
         t = self.trigger
         if t is None or t.trajectory.end <= start:
             return None
@@ -246,7 +275,7 @@ class ImageCollector:
         return t if moves and moves[-1][1] is t.trajectory else None
 
     def _infer(self, trigger: planned.Trigger | None, start: float) -> Inference | None:
-        """Infer frames and averages that the script leaves out."""
+        """Infer frames and averages that the script leaves out; warn of both."""
         camera = self.camera
         averages = camera.settings.averages if "averages" in camera.said else None
         frames = camera.settings.frames if "frames" in camera.said else None
@@ -273,12 +302,23 @@ class ImageCollector:
     def _fly(
         self, trigger: planned.Trigger, found: Inference, start: float, period: float
     ) -> tuple[FloatArray, dict[str, FloatArray]]:
-        """Nominal moments of the images, and their positions where the rule gives them."""
+        """Compute the nominal moments of a fly scan's images, and positions by the rule.
+
+        Args:
+            trigger: the motion during the scan.
+            found: frames and increment.
+            start: of the sequence [s].
+            period: exposure time of an image, averages included [s].
+
+        Returns:
+            Moments (n,) [s]; motor -> positions (n,), empty if the images lie where the
+            motor is.
+        """
         trajectory, unit, speed = trigger.trajectory, trigger.unit, trigger.speed
         sign = 1.0 if trajectory.target >= trigger.position else -1.0
         count = np.arange(found.frames, dtype=np.float64)
         late = start - trigger.time
-        if late > _TIME_EPS:
+        if late > _TIME_TOLERANCE_S:
             what = f"the sequence starts {late:.3g} s after {trigger.axis} passed its trigger"
             where = f"{trajectory.position(start):.6g}, not {trigger.position:g} {unit}"
             self.findings.warn("late_start", f"{what}: image 0 is at {where}")
@@ -289,10 +329,10 @@ class ImageCollector:
                 f"{found.mismatch:+.4g} {unit} more than whole turns; images are put at steps of "
                 f"{found.increment:.9g} {unit}",
             )
-        first = trigger.position if late <= _TIME_EPS else trajectory.position(start)
+        first = trigger.position if late <= _TIME_TOLERANCE_S else trajectory.position(start)
         wanted = first + sign * found.increment * count
         starts = start + found.increment / speed * count
-        off = np.abs(trajectory.positions(starts) - wanted) > _POSITION_EPS
+        off = np.abs(trajectory.positions(starts) - wanted) > _POSITION_TOLERANCE
         exact = {trigger.motor: wanted}
         if off.any():
             velocity = abs(trajectory.velocity(trigger.time))
@@ -311,6 +351,7 @@ class ImageCollector:
     # what is worth saying about a saved image ----------------------------------------------
 
     def _saved(self, draft: ExposureGroup) -> None:
+        """Check saved images: name, stated settings and X-rays."""
         clash = next((f for f in draft.files if f in self.names), None)
         if clash is not None:
             self.findings.warn("overwrites", f"{clash} is saved twice; the last one stays")
@@ -323,7 +364,7 @@ class ImageCollector:
             self.findings.warn("xrays_off", f"{what} taken with X-rays off")
 
     def _unsaid(self, draft: ExposureGroup) -> None:
-        """One warning for each setting that a saved image takes from the machine's defaults."""
+        """Warn of each setting that a saved image takes from the machine's defaults."""
         s = draft.camera
         self._default("mode", "the camera mode", s.mode)
         self._default("exposure_ms", "the exposure", f"{s.exposure_ms:g} ms")
@@ -337,7 +378,7 @@ class ImageCollector:
             self._default("power_W", "the tube power", f"{draft.power_W:g} W")
 
     def _default(self, name: str, what: str, value: str) -> None:
-        """One warning where the script states no value of a setting."""
+        """Warn once if the script states no value of a setting."""
         if name not in self.camera.said | self.tube.said | self._complained:
             self._complained.add(name)
             self.findings.warn(

@@ -46,12 +46,12 @@ class Trigger:
 
     @property
     def speed(self) -> float:
-        """The greatest on the way."""
+        """Greatest speed of the motion [unit/s]."""
         return max(abs(p.velocity) for p in self.trajectory.pieces)
 
     @property
     def acceleration(self) -> float:
-        """The greatest on the way."""
+        """Greatest acceleration of the motion [unit/s2]."""
         return max(abs(p.acceleration) for p in self.trajectory.pieces)
 
 
@@ -64,15 +64,15 @@ class Motor:
 
     @property
     def end(self) -> float:
-        """When the motor comes to rest."""
+        """Moment at which the motor comes to rest [s]."""
         return self.moves[-1][1].end if self.moves else 0.0
 
     def position(self, time: float) -> float:
-        """Position at `time`, which is not before the last move."""
+        """Return the position at `time`, which is not before the last move."""
         return self.moves[-1][1].position(time) if self.moves else self.home
 
     def move(self, target: float, time: float, speed: float, acceleration: float) -> Trajectory:
-        """Start towards `target` at `time`, from whatever the motor is doing."""
+        """Start a move to `target` at `time`, from the current position and velocity."""
         v = self.moves[-1][1].velocity(time) if self.moves else 0.0
         made = motion.move(self.position(time), v, target, speed, acceleration, time)
         if made.end > time:
@@ -91,40 +91,40 @@ class Motors:
         }
 
     def positions(self, time: float) -> dict[str, float]:
-        """Where all motors stand at `time`, not before any motor's last move."""
+        """Return motor -> position at `time`, not before any motor's last move."""
         return {n: m.position(time) for n, m in self.all.items()}
 
     def targets(self, axis: str, value: float, time: float) -> dict[str, float]:
-        """Motor -> target for a move of a motor or virtual axis; no limits here."""
+        """Compute motor -> target for a move of a motor or virtual axis, limits ignored."""
         here = {m: self.all[m].position(time) for m in self.machine.moves(axis)}
         return motor_targets(self.machine, axis, value, here)
 
     def rates(self, axis: str) -> dict[str, tuple[float, float]]:
-        """Motor -> (speed, acceleration); motors of a virtual axis keep in step."""
+        """Compute motor -> (speed, acceleration); motors of a virtual axis keep in step."""
         moves = self.machine.moves(axis)
         speed = min(self.all[n].speed / abs(f) for n, f in moves.items())
         acceleration = min(self.all[n].acceleration / abs(f) for n, f in moves.items())
         return {n: (speed * abs(f), acceleration * abs(f)) for n, f in moves.items()}
 
     def moving(self, time: float) -> list[str]:
-        """Motors still under way at `time`."""
+        """List the motors still under way at `time`."""
         return [n for n, m in self.all.items() if m.end > time]
 
     @property
     def end(self) -> float:
-        """When all motion is over."""
+        """Moment at which all motion is over [s]."""
         return max(m.end for m in self.all.values())
 
 
 @dataclass
 class PlannedTube:
-    """X-ray tube."""
+    """The X-ray tube: its setting, and the intervals with X-rays on."""
 
     kV: float
     power_W: float
     on: bool
     known: bool = True
-    """Whether on or off is known; a start that nobody told counts as off without being so."""
+    """Whether X-rays are known to be on or off; an unknown start counts as off."""
     ready_at: float = 0.0
     since: float = 0.0
 
@@ -134,6 +134,7 @@ class PlannedTube:
         self.lit_from = 0.0
 
     def _close(self, time: float) -> None:
+        """End the interval of one setting at `time`."""
         if self.on and time > self.since:
             self.beam.append(BeamOn(self.since, time, self.kV, self.power_W))
         self.since = time
@@ -145,7 +146,7 @@ class PlannedTube:
         self.lit_from = time
 
     def lit(self, time: float) -> bool:
-        """Whether X-rays are on at `time`, not before the last switching."""
+        """Return whether X-rays are on at `time`, not before the last switching."""
         return self.on and time >= self.lit_from
 
     def set(self, time: float, name: str, value: float) -> None:
@@ -155,7 +156,7 @@ class PlannedTube:
         self.said.add(name)
 
     def intervals(self, end: float) -> tuple[BeamOn, ...]:
-        """When X-rays were on, up to `end`."""
+        """List the intervals with X-rays on, up to `end`."""
         self._close(end)
         return tuple(self.beam)
 
@@ -169,10 +170,10 @@ class PlannedCamera:
         self.free_at = 0.0
 
     def set(self, name: str, value: Any) -> None:
-        """State one setting (a field of CameraSettings)."""
+        """Set a field of CameraSettings as stated by the script."""
         self.settings = replace(self.settings, **{name: value})
         self.said.add(name)
 
     def assume(self, name: str, value: Any) -> None:
-        """Put a value in force that the script does not state."""
+        """Set a field that the script does not state."""
         self.settings = replace(self.settings, **{name: value})

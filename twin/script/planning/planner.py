@@ -83,7 +83,11 @@ def plan_script(
 
 
 def simulated(commands: tuple[c.Command, ...], machine: Machine, start: StartState) -> Simulation:
-    """The commands run on a virtual clock: steps, motion and images, without what the beam sees."""
+    """Run commands on a virtual clock: steps, motion and images, without what the beam sees.
+
+    If averages are inferred from a scan, the commands run a second time with them,
+    because they apply to the images before the scan as well.
+    """
     simulation = Simulation(machine, start)
     simulation.run(commands)
     inferred = simulation.imaging.inferred_averages

@@ -23,7 +23,7 @@ from flexdt.twin.script.scan_request import REFERENCES
 
 Pose = Mapping[str, float]
 Route = Callable[[Pose, Pose], Sequence[Pose] | None]
-"""Where the motors stand and where they go, to moves one after the other; None: no free path."""
+"""Finds the moves from one pose to another; None if there is no free path."""
 _NO_FLAT: Final = (
     "no flat image is taken, as `flat` is false; without one the data set cannot be reconstructed"
 )
@@ -124,17 +124,18 @@ def plan_poses(
 
 
 def _image(file: str, line: int = 0) -> list[c.Command]:
+    """Make the commands that take and save one image."""
     return [c.TakeImage(line=line), c.SaveImage(path=file, line=line)]
 
 
 def _moves(pose: Pose, line: int = 0) -> list[c.Command]:
-    """Moves that start together; asking each again waits until all have arrived."""
+    """Make moves that start together; the second request of each waits for its arrival."""
     moves = [c.MoveAbsolute(component=a, target=float(v), line=line) for a, v in pose.items()]
     return [*(replace(k, wait=c.Wait.NO_WAIT) for k in moves if len(moves) > 1), *moves]
 
 
 def _arrival(positions: Pose, pose: Pose, machine: Machine, start: StartState) -> dict[str, float]:
-    """Where all motors stand at a pose that is reached from `positions`, within their travel."""
+    """Compute the positions of all motors at a pose reached from `positions`, within travel."""
     motors = Motors(machine, replace(start, positions=positions))
     out = dict(positions)
     for axis, value in pose.items():
@@ -143,6 +144,6 @@ def _arrival(positions: Pose, pose: Pose, machine: Machine, start: StartState) -
 
 
 def _legs(start: Pose, end: Pose, route: Route | None = None) -> Sequence[Pose] | None:
-    """The moves from one place to another: `route`'s, or all motors at once."""
+    """List the moves between two poses: those of `route`, or all motors at once."""
     goal = {axis: value for axis, value in end.items() if value != start[axis]}
     return ([goal] if goal else []) if route is None else route(start, goal)

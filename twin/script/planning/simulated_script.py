@@ -37,7 +37,8 @@ _CAMERA: Final = (c.CameraSetting, c.TakeImage, c.SaveImage, c.TakeSequence)
 
 
 def sample_size(data: bytes) -> SampleSize | None:
-    """The sample's diameter, or None if the data do not say one."""
+    """Decode the sample's diameter from the argument of `set sample info`; None if it has
+    none."""
     if len(data) < 12:
         return None
     (diameter,) = struct.unpack_from(">d", data)
@@ -47,7 +48,13 @@ def sample_size(data: bytes) -> SampleSize | None:
 
 
 class Simulation:
-    """A scanner on a clock; lives only while a plan is made."""
+    """A scanner on a virtual clock; lives only while a plan is made.
+
+    Args:
+        machine: whose axes, limits, camera and timing these are.
+        start: the scanner before the script.
+        averages: inferred in a first run, or None.
+    """
 
     def __init__(self, machine: Machine, start: StartState, averages: int | None = None) -> None:
         self.machine = machine
@@ -66,11 +73,11 @@ class Simulation:
 
     @property
     def end(self) -> float:
-        """When commands, motion and camera are all done."""
+        """Moment at which commands, motion and camera are all done [s]."""
         return max(self.now, self.motors.end, self.camera.free_at)
 
     def run(self, commands: tuple[c.Command, ...]) -> None:
-        """Simulate all commands in order."""
+        """Simulate all commands in order; add a step for each."""
         axes = (*self.machine.axes, *self.machine.virtual_axes)
         for command in commands:
             if isinstance(command, c.MotorCommand | c.Custom):
@@ -99,6 +106,7 @@ class Simulation:
             )
 
     def _release(self, command: c.Command, span: planned.Span) -> float:
+        """Return the moment at which the script goes on after a command."""
         if command.wait is c.Wait.ACK:
             return max(self.now, span.end)
         if command.wait is c.Wait.POS and span.release is not None:
@@ -106,9 +114,15 @@ class Simulation:
         return self.now
 
     def timed(self, kind: str, length: float = 0.0, note: str = "") -> planned.Span:
-        """A command of `length` [s] and the time that the machine's timing has for its kind.
+        """Make the span of a command that starts now: its length and the machine's time
+        for its kind.
 
         The script's own expected duration (column 7) is no prediction but a bound.
+
+        Args:
+            kind: of command, as in `Timing`.
+            length: of motion, pause or exposures [s].
+            note: added to the step's description.
         """
         overhead = self.machine.timing.seconds(kind)
         return planned.Span(self.now, self.now + length + overhead, overhead, kind, note=note)
@@ -116,6 +130,7 @@ class Simulation:
     # scanner -------------------------------------------------------------------------------
 
     def _custom(self, command: c.Custom) -> planned.Span:
+        """Warn if the component is an axis, which has no such command; no effect."""
         if command.component in self.machine.axes:
             self.findings.warn(
                 "custom_component",
@@ -124,12 +139,14 @@ class Simulation:
         return self.timed("command", note=" (no effect)")
 
     def _sample_info(self, command: c.SetSampleInfo) -> planned.Span:
+        """Take the sample's size from the argument, if it has one."""
         size = sample_size(command.data)
         if size is not None:
             self.sample = size
         return self.timed("command")
 
     def _write_settings(self, _command: c.WriteSettingsFile) -> planned.Span:
+        """Record positions, rates and settings of this moment."""
         motors = self.motors.all
         self.settings = Settings(
             self.motors.positions(self.now),
@@ -147,6 +164,7 @@ class Simulation:
     # tube ----------------------------------------------------------------------------------
 
     def _xray_on(self, _command: c.XrayOn) -> planned.Span:
+        """Switch X-rays on, unless they are."""
         if self.tube.on:
             return self.timed("command", note=" (already on)")
         span = self.timed("xrayon")
@@ -155,12 +173,14 @@ class Simulation:
         return span
 
     def _xray_off(self, _command: c.XrayOff) -> planned.Span:
+        """Switch X-rays off, unless they are known to be off."""
         if not self.tube.on and self.tube.known:
             return self.timed("xrayoff_again", note=" (already off)")
         self.tube.switch(False, self.now)
         return self.timed("xrayoff")
 
     def _ready(self, _command: c.WaitXrayReady) -> planned.Span:
+        """Wait until X-rays are ready; report a wait with X-rays off, which would hang."""
         if not self.tube.on:
             what = "waits until the X-rays are ready, but they are off: the script would hang here"
             self.findings.error("xray_never_ready", what)
@@ -171,7 +191,7 @@ class Simulation:
         return planned.Span(self.now, self.now + left, left, "xray_ready")
 
     def _tube(self, change: Mapping[str, float]) -> planned.Span:
-        """Voltage or power; what the tube does not allow is noted and stays as it was."""
+        """Set voltage or power; report a value that is not allowed and keep the old one."""
         [(name, value)] = change.items()
         now = TubeSettings(self.tube.kV, self.tube.power_W)
         try:
@@ -185,7 +205,7 @@ class Simulation:
     # camera --------------------------------------------------------------------------------
 
     def _stated(self, change: CameraChange) -> planned.Span:
-        """One setting of the camera; what the panel does not allow is noted and stays as it was."""
+        """Set a camera setting; report a value that is not allowed and keep the old one."""
         [(name, value)] = change.items()
         now = self.camera.settings
         try:
@@ -203,7 +223,7 @@ class Simulation:
     # motors --------------------------------------------------------------------------------
 
     def _axis(self, command: c.MotorCommand) -> bool:
-        """Whether the machine has the axis; notes it if not."""
+        """Return whether the machine has the axis; report it if not."""
         name = command.component
         if self.machine.has(name):
             return True
@@ -216,6 +236,7 @@ class Simulation:
         return False
 
     def _set_rate(self, command: c.SetSpeed | c.SetAcceleration) -> planned.Span:
+        """Set an axis's speed or acceleration, limited to what its motors allow."""
         if not self._axis(command):
             return self.timed("command", note=" (no effect)")
         what: Rate = "speed" if isinstance(command, c.SetSpeed) else "acceleration"
@@ -231,7 +252,7 @@ class Simulation:
         return self.timed("set_motor", note=note)
 
     def _tell(self, found: Arrival) -> None:
-        """Note what lies beyond a limit, as `twin/machine/travel.py` judges it."""
+        """Report what lies beyond a limit, as `twin/machine/travel.py` judges it."""
         for message in found.told:
             if found.is_clamped(self.machine):
                 self.findings.warn("limit_clamped", f"{message}; set to the limit")
@@ -239,6 +260,7 @@ class Simulation:
                 self.findings.error("limit", message)
 
     def _move(self, command: c.MoveAbsolute) -> planned.Span:
+        """Start a move of an axis within its travel; register its trigger."""
         if not self._axis(command):
             return self.timed("command", note=" (no effect)")
         name = command.component
@@ -271,7 +293,19 @@ class Simulation:
         begin: Mapping[str, float],
         end: float,
     ) -> float:
-        """When the motor passes the trigger; at arrival if it never does."""
+        """Find the moment at which the motor passes the trigger, and register the trigger.
+
+        Args:
+            command: the move.
+            trigger: position of the axis at which the script goes on [unit].
+            made: motor -> trajectory.
+            begin: motor -> position before the move.
+            end: of the motion [s].
+
+        Returns:
+            Moment [s]; `end`, with an error reported, if the motor never passes the
+            trigger.
+        """
         virtual = self.machine.virtual_axes.get(command.component)
         motor = command.component if virtual is None else virtual.of
         position = trigger if virtual is None else (trigger - virtual.constant) / virtual.factor
@@ -313,4 +347,4 @@ _EFFECTS: Final[Mapping[type[c.Command], _Effect]] = {
     c.SetAcceleration: Simulation._set_rate,
     c.Custom: Simulation._custom,
 }
-"""By the command's type, or the nearest above it."""
+"""Simulator of each command's type, or of the nearest type above it."""

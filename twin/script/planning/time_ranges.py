@@ -19,10 +19,11 @@ class _OfKind(Protocol):
 
 
 def step_range(step: PlanStep, timing: Timing) -> Range | None:
-    """(5 %, 95 %) of how long the script waits for a step [s].
+    """Return (5 %, 95 %) of how long the script waits for a step [s].
 
-    None where no time of the machine is measured. A time that is only assumed, on a machine whose
-    other times are measured, is taken as anything from nothing to twice itself.
+    None where no time of the machine is measured. A time that is only assumed, on a
+    machine whose other times are measured, is taken as anything from nothing to twice
+    itself.
     """
     if not timing.spread:
         return None
@@ -31,12 +32,12 @@ def step_range(step: PlanStep, timing: Timing) -> Range | None:
 
 
 def total_range(steps: Iterable[_OfKind], duration_s: float, timing: Timing) -> Range | None:
-    """(5 %, 95 %) of a scan's duration [s], or None as for `step_range`.
+    """Compute (5 %, 95 %) of a scan's duration [s], or None as for `step_range`.
 
-    Steps are independent of each other, but what a kind's median is wrong by, from n times, all
-    its steps have in common: the variance of one step's error is (1 + 1/n) of the command's own,
-    that of N steps N + N^2 / n. The drift of all times is common to all steps and added to that,
-    as systematic errors are.
+    Steps are independent of each other, but what a kind's median is wrong by, from n
+    times, all its steps have in common: the variance of one step's error is (1 + 1/n) of
+    the command's own, that of N steps N + N^2 / n. The drift of all times is common to
+    all steps and added to that, as systematic errors are.
 
     Args:
         steps: of a plan, or lines of a log.
@@ -56,6 +57,7 @@ def total_range(steps: Iterable[_OfKind], duration_s: float, timing: Timing) -> 
 
 
 def _margins(kind: str, timing: Timing) -> Range:
+    """Return how far a time of a kind may be below and above its median [s]."""
     middle = timing.seconds(kind)
     spread = timing.spread.get(kind)
     if spread is None:
