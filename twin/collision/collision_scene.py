@@ -25,17 +25,20 @@ from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.motion.profiles import AxisPath, Trajectory
 
-REACH_SLACK = 10.0
-"""Poses this far outside the travel limits [mm] are still checked against the short list of pairs
-(Table 6.1 lies outside by up to 9 mm); beyond, every pair is looked at."""
+REACH_SLACK_MM = 10.0
+"""Distance beyond the travel limits within which the short list of pairs suffices [mm].
+
+Table 6.1 is outside by up to 9 mm; farther out, every pair is checked.
+"""
 TOLERANCE_MM = 0.01
+"""A gap within this of the margin is a contact [mm]."""
 ACCURACY = (0.1, 0.02)
-"""See `Limits`."""
+"""Error allowed in the least clearance: [mm], and relative; see `Limits`."""
 
 
 @dataclass(frozen=True, eq=False)
 class SceneParts:
-    """What a scene is built from; see `build_scene`."""
+    """Values from which a scene is built; see `build_scene`."""
 
     machine: Machine
     profile: Profile
@@ -45,12 +48,12 @@ class SceneParts:
 
     @property
     def mounts(self) -> tuple[str, ...]:
-        """Motors of stages on the turntable, which the scene has everywhere they can go."""
+        """Motors of stages on the turntable; the scene covers all their positions."""
         geometry = self.machine.geometry
         return tuple(m for q in ("mount_x", "mount_y") for m in geometry.get(q, {}))
 
     def at(self, positions: Mapping[str, float]) -> CollisionScene:
-        """The scene with those stages at the positions that motors have [mm]."""
+        """Build the scene with these stages fixed at the motors' `positions` [mm]."""
         axes = dict(self.machine.axes)
         for name in self.mounts:
             here = positions.get(name, axes[name].home)
@@ -63,18 +66,18 @@ class SceneParts:
 
 @dataclass(frozen=True, eq=False)
 class CollisionScene:
-    """What may touch what.
+    """Bodies of a machine, and the pairs of them that must not touch.
 
     Attributes:
         axes: motors, in the order of all columns.
         bodies: convex bodies.
-        pairs: indices of the bodies that may not touch.
-        distant: pairs that cannot touch while every motor stays within `reach`, either parts of
-            one stage or always at different levels.
+        pairs: indices of the bodies that must not touch.
+        distant: pairs that cannot touch while every motor stays within `reach`, either
+            parts of one stage or always at different levels.
         reach: (axes, 2) lower and upper position for which `distant` holds.
         home: (axes,) positions of motors that a pose leaves out.
         limits: margin, tolerance, accuracy.
-        parts: what it was built from; None for bodies of one's own.
+        parts: values from which it was built; None for other bodies.
     """
 
     axes: tuple[str, ...]
@@ -86,18 +89,21 @@ class CollisionScene:
     limits: Limits
     parts: SceneParts | None = None
     _separations: dict[tuple[int, int], Separate] = field(default_factory=dict, repr=False)
-    """Made when first asked for. Threads that share a scene may make one twice, which costs only
-    the work: what they make is equal, keeps nothing between calls, and is put in whole."""
+    """Filled on first use. Threads that share a scene may compute one twice.
+
+    That costs only the work: the results are equal, keep no state, and are stored
+    complete.
+    """
 
     def separation(self, pair: tuple[int, int]) -> Separate:
-        """The certified clearance of a pair, made when first asked for."""
+        """Return the certified clearance of a pair as a function; made on first use."""
         if pair not in self._separations:
             a, b = (self.bodies[i].solid for i in pair)
             self._separations[pair] = separation_of(a, b)
         return self._separations[pair]
 
     def names(self, pair: tuple[int, int]) -> tuple[str, str]:
-        """Names of a pair's components."""
+        """Return the names of a pair's components."""
         return self.bodies[pair[0]].name, self.bodies[pair[1]].name
 
     @cached_property
@@ -111,12 +117,14 @@ class CollisionScene:
         return PairStack.of(len(self.axes), self.bodies, (*self.pairs, *self.distant))
 
     def candidates(self, lower: FloatArray, upper: FloatArray) -> PairStack:
-        """The pairs to look at while motors stay in [lower, upper]: the near ones, or all."""
+        """Return the pairs to check while motors stay in [lower, upper]: the near ones,
+        or all."""
         within = (lower >= self.reach[:, 0]).all() and (upper <= self.reach[:, 1]).all()
         return self.near if within else self.all
 
     def path(self, trajectories: Mapping[str, Trajectory], start: float, end: float) -> Path:
-        """All motors from `start` to `end` [s]; those left out stand at home."""
+        """Make the path of all motors from `start` to `end` [s]; those left out stand at
+        home."""
         tables = {
             name: AxisPath.along(trajectories[name])
             if name in trajectories
@@ -126,7 +134,7 @@ class CollisionScene:
         return path_of(self.axes, tables, start, end)
 
     def vector(self, positions: Mapping[str, float]) -> FloatArray:
-        """Positions as (axes,); motors left out stand at home [mm, deg]."""
+        """Convert positions to (axes,) [mm, deg]; motors left out stand at home."""
         return np.array(
             [positions.get(n, h) for n, h in zip(self.axes, self.home.tolist(), strict=True)]
         )
@@ -154,7 +162,7 @@ class PairStack:
 
     @classmethod
     def of(cls, axes: int, bodies: Sequence[Body], pairs: Sequence[tuple[int, int]]) -> PairStack:
-        """From the number of motors, the bodies, and the pairs to look at."""
+        """Stack pairs of `bodies`, which `axes` motors move."""
         chosen = [(bodies[i], bodies[j]) for i, j in pairs]
         slides = np.array([a.slides - b.slides for a, b in chosen]).reshape(len(pairs), axes, 3)
         turns = [(a.turns != 0.0) & a.spins | (b.turns != 0.0) & b.spins for a, b in chosen]
@@ -172,9 +180,10 @@ class PairStack:
         return np.abs(self.slides)
 
     def clearances(self, lower: FloatArray, upper: FloatArray) -> FloatArray:
-        """Lower bounds of the clearances while the motors stay within a box of positions.
+        """Compute lower bounds of the clearances while motors stay within a box of positions.
 
-        Motors that carry both bodies of a pair cancel; turning bodies count at every angle.
+        Motors that carry both bodies of a pair cancel; turning bodies count at every
+        angle.
 
         Args:
             lower: (..., axes) positions.
@@ -199,7 +208,7 @@ def build_scene(
     *,
     margin_mm: float | None = None,
 ) -> CollisionScene:
-    """The scene of a machine with a sample.
+    """Build the scene of a machine with a sample.
 
     Args:
         machine: its components, limits, margin.
@@ -217,7 +226,7 @@ def build_scene(
         bodies,
         {frozenset(pair) for pair in machine.allowed_contacts},
         reach=np.array(
-            [(a.lower - REACH_SLACK, a.upper + REACH_SLACK) for a in machine.axes.values()]
+            [(a.lower - REACH_SLACK_MM, a.upper + REACH_SLACK_MM) for a in machine.axes.values()]
         ),
         home=np.array([a.home for a in machine.axes.values()]),
         limits=Limits(margin, TOLERANCE_MM, ACCURACY),
@@ -234,7 +243,7 @@ def scene_of(
     home: FloatArray,
     limits: Limits,
 ) -> CollisionScene:
-    """A scene of any bodies: sorts their pairs into near, distant and allowed.
+    """Build a scene of any bodies: sort their pairs into near, distant and allowed.
 
     Args:
         axes: motors, in the order of the bodies' columns.
@@ -268,11 +277,12 @@ def scene_of(
 
 
 def _one_stage(a: Body, b: Body) -> bool:
+    """Return whether two bodies belong to one stage, or one of them to the world."""
     return a.stage == b.stage or "world" in (a.stage, b.stage)
 
 
 def _levels_apart(a: Body, b: Body) -> bool:
-    """Whether a gap keeps them apart along a direction in which no motor moves them."""
+    """Return whether a gap separates them along a direction in which no motor moves them."""
     fixed = ~(a.slides - b.slides).any(axis=0)
     offset = a.origin - b.origin
     above = offset + a.bounds[0] - b.bounds[1] > 0.0

@@ -19,10 +19,11 @@ from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.conventions import FloatArray
 
 MAX_PIECES = 8
-WORTHWHILE = 0.9
-"""A cut must bring the volume of the hulls below this part of what it was."""
+"""Largest number of pieces of a sample."""
+MAX_VOLUME_SHARE = 0.9
+"""Largest volume of the hulls after a cut, as a part of the volume before."""
 MAX_CUTTING_FACES = 50_000
-"""Meshes with more faces get one hull, so that a large upload does not hold up the twin."""
+"""Meshes with more faces get one hull, so that a large upload does not block the twin."""
 
 
 class Mesh(Protocol):
@@ -44,7 +45,7 @@ def convex_pieces(
     offset: npt.ArrayLike = (0.0, 0.0, 0.0),
     max_pieces: int = MAX_PIECES,
 ) -> tuple[Polytope, ...]:
-    """Convex pieces that together contain the mesh's solid.
+    """Divide a mesh into convex pieces that together contain its solid.
 
     Args:
         mesh: its surface [mm].
@@ -88,9 +89,9 @@ class _Piece:
 
 
 def _best_cut(piece: _Piece) -> Sequence[_Piece] | None:
-    """The halves of the best of a few cuts, or None when none is worthwhile."""
+    """Find the halves of the best of a few cuts; None if none is worthwhile."""
     points = piece.hull.vertices
-    best, wanted = None, WORTHWHILE * piece.volume
+    best, wanted = None, MAX_VOLUME_SHARE * piece.volume
     for axis in range(3):
         low, high = points[:, axis].min(), points[:, axis].max()
         for share in (0.25, 0.5, 0.75):
@@ -106,7 +107,14 @@ def _best_cut(piece: _Piece) -> Sequence[_Piece] | None:
 
 
 def _clip(triangles: FloatArray, axis: int, at: float, side: float) -> FloatArray:
-    """The triangles on one side of a plane, and a convex cap over the cut that closes them."""
+    """Clip triangles at a plane, and close the cut with a convex cap.
+
+    Args:
+        triangles: (n, 3, 3) corners [mm].
+        axis: number of the coordinate axis across the plane.
+        at: position of the plane [mm].
+        side: +1 keeps what is above it, -1 what is below.
+    """
     height = side * (triangles[:, :, axis] - at)
     count = (height >= 0.0).sum(axis=1)
     one, two = count == 1, count == 2
@@ -126,14 +134,14 @@ def _clip(triangles: FloatArray, axis: int, at: float, side: float) -> FloatArra
 
 
 def _led_by(triangles: FloatArray, height: FloatArray, sign: float) -> FloatArray:
-    """Triangles with their corners turned so that the first has the largest sign * height."""
+    """Rotate the corners of triangles so that the first has the largest sign * height."""
     first = np.argmax(sign * height, axis=1)
     order = (first[:, None] + np.arange(3)) % 3
     return np.take_along_axis(triangles, order[:, :, None], axis=1)
 
 
 def _crossing(start: FloatArray, end: FloatArray, axis: int, at: float) -> FloatArray:
-    """Where the edges cross the plane, (n, 3)."""
+    """Compute where edges cross the plane, (n, 3)."""
     share = (at - start[:, axis]) / (end[:, axis] - start[:, axis])
     points = start + share[:, None] * (end - start)
     points[:, axis] = at
@@ -141,7 +149,7 @@ def _crossing(start: FloatArray, end: FloatArray, axis: int, at: float) -> Float
 
 
 def _cap(points: FloatArray, axis: int) -> FloatArray:
-    """Triangles over the convex hull of points of a plane across `axis`."""
+    """Triangulate the convex hull of points of a plane across `axis`."""
     from scipy.spatial import ConvexHull, QhullError
 
     if len(points) < 3:

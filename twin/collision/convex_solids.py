@@ -31,23 +31,26 @@ _BOX_FACES = np.array(
 
 
 class ConvexSolid(Protocol):
-    """What the sweep asks of a convex solid, in the frame of the body that carries it."""
+    """Interface of a convex solid, in the frame of the body that carries it."""
 
     def farthest(self, directions: FloatArray) -> FloatArray:
-        """A point of the solid that lies farthest along each of directions, (..., 3) both."""
+        """Return a point of the solid farthest along each direction, (..., 3) both."""
 
     def support(self, directions: FloatArray) -> FloatArray:
-        """Largest p . direction over the solid's points p, (...) [mm, for unit directions]."""
+        """Compute the largest p . direction over the solid's points p, (...) [mm, for
+        unit directions]."""
         return np.asarray((directions * self.farthest(directions)).sum(axis=-1))
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corner of the axis-aligned box around it, (3,) each [mm]."""
+        """Return the lower and upper corner of the axis-aligned box around it, (3,) each
+        [mm]."""
 
     def radius_about(self, axis: FloatArray) -> float:
-        """Farthest distance of any point from the line through the origin along `axis` [mm]."""
+        """Compute the largest distance of any point from the line through the origin
+        along `axis` [mm]."""
 
     def is_round(self, axis: FloatArray) -> bool:
-        """Whether turning about that line leaves it as it is."""
+        """Return whether turning about that line leaves the solid unchanged."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +120,7 @@ class UprightCylinder(ConvexSolid):
         return self._upright(axis) and self.center[0] == 0.0 and self.center[1] == 0.0
 
     def prism(self, sides: int = 48) -> Polytope:
-        """A prism around it; 48 sides stand out by 0.2 % of the radius at the edges."""
+        """Make a prism around the cylinder; 48 sides add 0.2 % of the radius at the edges."""
         angle = 2.0 * math.pi * np.arange(sides) / sides
         rim = self.radius / math.cos(math.pi / sides) * np.stack([np.cos(angle), np.sin(angle)])
         ends = [np.vstack([rim, np.full(sides, s * self.height / 2)]).T for s in (-1.0, 1.0)]
@@ -125,19 +128,21 @@ class UprightCylinder(ConvexSolid):
 
     @staticmethod
     def _upright(axis: FloatArray) -> bool:
+        """Return whether `axis` is vertical."""
         return bool(axis[0] == 0.0 and axis[1] == 0.0)
 
 
 def box(size: npt.ArrayLike, center: npt.ArrayLike = (0.0, 0.0, 0.0)) -> Polytope:
-    """The box with edges `size` (3,) about `center` (3,) [mm], along the frame's axes."""
+    """Make the box with edges `size` (3,) about `center` (3,) [mm], along the frame's axes."""
     half = 0.5 * np.asarray(size, dtype=np.float64)
     return Polytope(_CORNERS * half + np.asarray(center, dtype=np.float64), _BOX_FACES)
 
 
 def hull(points: npt.ArrayLike) -> Polytope:
-    """The convex hull of `points` (k, 3) [mm].
+    """Compute the convex hull of `points` (k, 3) [mm].
 
-    Flat or thin point sets are thickened by a micrometre, outwards, so that every hull is a solid.
+    Flat or thin point sets are thickened by a micrometre, outwards, so that every hull is
+    a solid.
     """
     from scipy.spatial import ConvexHull, QhullError
 

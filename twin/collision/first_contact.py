@@ -38,13 +38,14 @@ class NearestPair:
 
 @dataclass(frozen=True)
 class SweepResult:
-    """What a sweep found.
+    """Result of a sweep.
 
     Attributes:
         contact: the first, or None.
-        min_clearance_mm: least clearance up to the contact of bodies that move relative to each
-            other; inf when none do. It occurs in the motion, and no clearance before the contact
-            is smaller by more than the scene's accuracy (0.1 mm, or 2 % if that is more).
+        min_clearance_mm: least clearance up to the contact of bodies that move relative
+            to each other; inf when none do. It occurs in the motion, and no clearance
+            before the contact is smaller by more than the scene's accuracy (0.1 mm, or 2
+            % if that is more).
         nearest: the pair that has it.
         looks: number of distance evaluations.
     """
@@ -56,7 +57,7 @@ class SweepResult:
 
 
 def first_contact(scene: CollisionScene, path: Path) -> Contact | None:
-    """The first contact along a path, without its clearances."""
+    """Find the first contact along a path, without clearances; None if there is none."""
     return PathSearch(scene, path).first_contact(only_contacts=True).contact
 
 
@@ -67,10 +68,12 @@ class PathSearch:
     scene: CollisionScene
     path: Path
     _motions: dict[int, RelativeMotion] = field(default_factory=dict, init=False, repr=False)
-    """Made when first asked for; a search belongs to the one thread that made it."""
+    """Filled on first use; a search belongs to the thread that made it."""
 
     @cached_property
     def _nearest_first(self) -> tuple[list[Pair], list[float]]:
+        """Pairs that move relative to each other, and bounds of their clearances,
+        ascending [mm]."""
         lower, upper = self.path.q.min(axis=0), self.path.q.max(axis=0)
         stack = self.scene.candidates(lower, upper)
         bounds = stack.clearances(lower, upper)
@@ -89,14 +92,19 @@ class PathSearch:
         return self._nearest_first[1]
 
     def motion(self, k: int) -> RelativeMotion:
-        """The relative motion of pair k."""
+        """Return the relative motion of pair k, made on first use."""
         if k not in self._motions:
             a, b = (self.scene.bodies[i] for i in self.pairs[k])
             self._motions[k] = RelativeMotion(a, b, self.path)
         return self._motions[k]
 
     def first_contact(self, *, only_contacts: bool = False) -> SweepResult:
-        """The first contact, and the least clearance seen on the way (not refined)."""
+        """Find the first contact, and the least clearance seen on the way (not refined).
+
+        Args:
+            only_contacts: skip pairs too distant for a contact, so that clearances are
+                incomplete.
+        """
         limits = self.scene.limits
         best, nearest, looks = math.inf, None, 0
         first: tuple[float, int, PairResult] | None = None
@@ -120,7 +128,7 @@ class PathSearch:
         return SweepResult(contact, contact.clearance_mm, contact.pair, looks=looks)
 
     def refined(self, guess: SweepResult) -> SweepResult:
-        """The least clearance of a free path, from a guess."""
+        """Refine the least clearance of a free path, from a guess."""
         best, nearest, looks = guess.min_clearance_mm, guess.nearest, guess.looks
         for k, bound in enumerate(self.bounds):
             if bound >= best - self.scene.limits.slack(best):
@@ -133,7 +141,7 @@ class PathSearch:
         return SweepResult(None, best, nearest, looks=looks)
 
     def contact(self, k: int, found: PairResult) -> Contact:
-        """The contact of pair k in the scene's terms."""
+        """Convert the contact of pair k to the scene's terms."""
         motion = self.motion(k)
         at = START if found.contact is None else found.contact
         time = motion.time(at)
@@ -152,7 +160,7 @@ class PathSearch:
 
 
 def clearance(scene: CollisionScene, positions: Mapping[str, float]) -> NearestPair:
-    """The nearest pair of a pose (all pairs that may not touch), clearance 0 for a contact."""
+    """Find the nearest pair of a pose (all pairs that must not touch), with 0 for a contact."""
     q = scene.vector(positions)
     stack = scene.candidates(q, q)
     return _nearest(scene, q, stack.pairs, stack.clearances(q, q))
@@ -161,13 +169,14 @@ def clearance(scene: CollisionScene, positions: Mapping[str, float]) -> NearestP
 def touching(
     scene: CollisionScene, positions: Mapping[str, float]
 ) -> list[tuple[tuple[str, str], float]]:
-    """Every pair of a pose that is within the margin, with its clearance [mm]."""
+    """List every pair of a pose that is within the margin, with its clearance [mm]."""
     found = bodies_touching(scene, scene.vector(positions))
     return [(scene.names(pair), gap) for pair, gap in found]
 
 
 def bodies_touching(scene: CollisionScene, q: FloatArray) -> list[tuple[Pair, float]]:
-    """Every pair within the margin with the motors at `q` (axes,), with its clearance [mm]."""
+    """List every pair within the margin with the motors at `q` (axes,), with its
+    clearance [mm]."""
     stack = scene.candidates(q, q)
     limit = scene.limits.margin + scene.limits.tolerance
     near = np.flatnonzero(stack.clearances(q, q) <= limit).tolist()
@@ -178,7 +187,7 @@ def bodies_touching(scene: CollisionScene, q: FloatArray) -> list[tuple[Pair, fl
 def clearance_trace(
     scene: CollisionScene, path: Path, times: Sequence[float] | FloatArray
 ) -> tuple[tuple[float, float, tuple[str, str] | None], ...]:
-    """(time [s], clearance [mm], pair) at each of `times`."""
+    """Compute (time [s], clearance [mm], pair) at each of `times`."""
     if len(times) == 0:
         return ()
     q = path.vectors(np.asarray(times, dtype=np.float64))
@@ -191,6 +200,8 @@ def clearance_trace(
 def _nearest(
     scene: CollisionScene, q: FloatArray, pairs: Sequence[Pair], bounds: FloatArray
 ) -> NearestPair:
+    """Find the nearest pair with the motors at `q`; `bounds` are lower bounds of the
+    clearances."""
     best = NearestPair(math.inf, None)
     for k in np.argsort(bounds, kind="stable").tolist():
         if bounds[k] >= best.mm:
@@ -202,7 +213,8 @@ def _nearest(
 
 
 def separation_at(scene: CollisionScene, pair: Pair, q: FloatArray) -> float:
-    """Certified clearance [mm] of a pair with the motors at `q` (axes,); 0 for an overlap."""
+    """Compute the certified clearance [mm] of a pair with the motors at `q` (axes,); 0
+    for an overlap."""
     a, b = (scene.bodies[i] for i in pair)
     offset = q @ (a.slides - b.slides) + (a.origin - b.origin)
     turn_a = a.rotation(float(q @ a.turns)) if a.spins else None

@@ -16,25 +16,26 @@ from flexdt.twin.collision.retreat import _Overlap, leaving
 from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.scanner.safety import Contact
 
-HORIZON = 3600.0
-"""A motion without an end (a jog that is held) is looked at so far ahead [s]."""
+HORIZON_S = 3600.0
+"""Time ahead for which a motion without an end (a jog that is held) is swept [s]."""
 
 
 @dataclass(frozen=True)
 class SceneGuard:
-    """Sweeps one scene; it keeps nothing between calls, so that threads may share it."""
+    """Sweeps one scene; it keeps no state between calls, so that threads may share it."""
 
     scene: CollisionScene
 
     def __call__(self, trajectories: Mapping[str, Trajectory], now: float) -> Contact | None:
-        """The first contact from `now` on; when nothing moves, the nearest pair that touches.
+        """Find the first contact from `now` on; when nothing moves, the nearest pair that
+        touches.
 
         Args:
             trajectories: motor -> trajectory; motors left out stand at home.
             now: since when [s].
         """
         scene = self.scene
-        ends = [t.end if math.isfinite(t.end) else now + HORIZON for t in trajectories.values()]
+        ends = [t.end if math.isfinite(t.end) else now + HORIZON_S for t in trajectories.values()]
         path = scene.path(trajectories, now, max([now, *ends]))
         if path.moving.any():
             contact = first_contact(scene, path)
@@ -49,8 +50,10 @@ class SceneGuard:
         return Contact(pair, now, here, here, now, near[pair], free_before=False)
 
     def standing(self, positions: Mapping[str, float]) -> SceneGuard:
-        """The guard with stages on the turntable where they stand: contacts as they are, and not
-        of all that such a stage can sweep with its sample.
+        """Return the guard with stages on the turntable fixed where they are.
+
+        Contacts are then those of this pose, and not those of all that such a stage can
+        sweep with its sample.
 
         Args:
             positions: motor -> position [mm, deg].
@@ -61,11 +64,12 @@ class SceneGuard:
     def touching(
         self, positions: Mapping[str, float], *, deep: bool = False
     ) -> dict[tuple[str, str], float]:
-        """Pairs of a pose that are within the safety margin, with their clearances [mm].
+        """Find the pairs of a pose within the safety margin, with their clearances [mm].
 
         Args:
             positions: motor -> position; motors left out stand at home [mm, deg].
-            deep: measure overlaps, as negative clearances; it takes some milliseconds a pair.
+            deep: measure overlaps, as negative clearances; it takes some milliseconds a
+                pair.
         """
         scene, q = self.scene, self.scene.vector(positions)
         out: dict[tuple[str, str], float] = {}

@@ -25,10 +25,11 @@ Station = tuple[float, ...]
 Way = tuple[tuple[str, float], ...]
 
 MAX_SWEEPS = 2000
-"""Sweeps after which a search gives up; about half a second."""
+"""Largest number of sweeps of a search; about half a second."""
 HALVINGS = 4
 """Bisection steps with which an excursion is shortened."""
-QUARTER = 90.0
+ASIDE_TURN_DEG = 90.0
+"""Turn of a rotation that moves aside [deg]."""
 
 
 def free_moves(
@@ -38,19 +39,21 @@ def free_moves(
     targets: Mapping[str, float],
     paces: Mapping[str, Pace] | None = None,
 ) -> tuple[list[dict[str, float]] | None, Contact | None]:
-    """Moves that lead from `start` to `targets` without a contact, each from rest to rest.
+    """Find moves from `start` to `targets` without a contact, each from rest to rest.
 
     Args:
-        scene: what may touch what.
+        scene: bodies and pairs that must not touch.
         machine: travel limits, speeds, accelerations.
         start: positions of all motors (those left out stand at home) [mm, deg].
         targets: motors to move, absolute, within their travel.
         paces: motor -> (speed, acceleration); default: the machine's.
 
     Returns:
-        Moves one after the other, each motor -> position, the motors of one move together; one
-        move if the direct way is free. None if no free way was found. And what stands in the way
-        when all motors go at once, or None.
+        (moves, contact). Moves in order, each motor -> position, the motors of one move
+        together;
+        one move if the direct path is free, None if no free path was found. The contact
+        is that
+        of all motors moving at once, or None.
     """
     search = _Planner(scene, machine, dict(start), dict(paces or {}))
     goal = {axis: value for axis, value in targets.items() if value != search.at(axis)}
@@ -71,7 +74,7 @@ def free_moves(
 
 @dataclass(eq=False)
 class _Planner:
-    """One question: counts its sweeps and remembers which parts were in the way."""
+    """One search: counts its sweeps and remembers which parts were obstacles."""
 
     scene: CollisionScene
     machine: Machine
@@ -82,15 +85,16 @@ class _Planner:
     known: dict[tuple[object, ...], bool] = field(default_factory=dict)
 
     def at(self, axis: str) -> float:
-        """Where a motor stands at the start."""
+        """Return the position of a motor at the start."""
         return self.start.get(axis, self.machine.axes[axis].home)
 
     def pace(self, axis: str) -> Pace:
+        """Return the speed and acceleration of a motor."""
         a = self.machine.axes[axis]
         return self.paces.get(axis, (a.speed, a.acceleration))
 
     def contact(self, moved: Mapping[str, float], step: Mapping[str, float]) -> Contact | None:
-        """First contact of one move from the start with `moved` changed."""
+        """Sweep one move from the start with `moved` changed; return its first contact."""
         trajectories = {}
         for axis in self.scene.axes:
             here = moved.get(axis, self.at(axis))
@@ -105,18 +109,18 @@ class _Planner:
         return contact
 
     def free(self, moved: Mapping[str, float], axis: str, value: float) -> bool:
-        """Whether one motor's move is free; remembered."""
+        """Return whether one motor's move is free; the answer is remembered."""
         key = (tuple(sorted(moved.items())), axis, value)
         if key not in self.known:
             self.known[key] = self.contact(moved, {axis: value}) is None
         return self.known[key]
 
     def duration(self, axis: str, start: float, end: float) -> float:
-        """Time of a move from rest to rest [s]."""
+        """Compute the time of a move from rest to rest [s]."""
         return motion.move(start, 0.0, end, *self.pace(axis), 0.0).duration
 
     def stations(self, goal: Mapping[str, float]) -> dict[str, list[float]]:
-        """Positions worth stopping at: for the goal's motors and those of what was in the way."""
+        """List positions worth a stop for the goal's motors and those of the obstacles."""
         chains = [
             body.slides.any(axis=1) | (body.turns != 0.0)
             for body in self.scene.bodies
@@ -130,19 +134,28 @@ class _Planner:
             a, here = self.machine.axes[axis], self.at(axis)
             aside = [a.lower, a.upper, a.home, 0.5 * (a.lower + a.upper)]
             if a.kind == "rotation":
-                aside = [x for x in (here - QUARTER, here + QUARTER) if a.lower <= x <= a.upper]
+                aside = [
+                    x
+                    for x in (here - ASIDE_TURN_DEG, here + ASIDE_TURN_DEG)
+                    if a.lower <= x <= a.upper
+                ]
             out[axis] = list(dict.fromkeys([here, goal.get(axis, here), *aside]))
         return out
 
     def shortest(
         self, stations: Mapping[str, Sequence[float]], goal: Mapping[str, float]
     ) -> list[tuple[str, float]] | None:
-        """A* over stations, one motor at a time; the cost is time."""
+        """Search for the quickest free path over stations (A*), one motor at a time.
+
+        Returns:
+            (motor, position) in order; None if there is none within `MAX_SWEEPS`.
+        """
         axes = list(stations)
         begin: Station = tuple(self.at(axis) for axis in axes)
         end: Station = tuple(goal.get(axis, self.at(axis)) for axis in axes)
 
         def left(station: Station) -> float:
+            """Estimate the remaining time from below [s]."""
             return sum(
                 self.duration(axis, x, y) for axis, x, y in zip(axes, station, end, strict=True)
             )
@@ -175,7 +188,7 @@ class _Planner:
     def shortened(
         self, way: list[tuple[str, float]], goal: Mapping[str, float]
     ) -> list[tuple[str, float]]:
-        """The same path with its excursions shortened as far as it stays free."""
+        """Shorten the excursions of a path as far as it stays free."""
         for i, (axis, value) in enumerate(way):
             earlier = [v for a, v in way[:i] if a == axis]
             before = earlier[-1] if earlier else self.at(axis)
@@ -192,6 +205,7 @@ class _Planner:
         return way
 
     def _all_free(self, way: Sequence[tuple[str, float]]) -> bool:
+        """Return whether every move of a path is free."""
         moved: dict[str, float] = {}
         for axis, value in way:
             if not self.free(moved, axis, value):
@@ -200,7 +214,7 @@ class _Planner:
         return True
 
     def joined(self, way: Sequence[tuple[str, float]]) -> list[dict[str, float]]:
-        """Neighbouring moves made together where that is free too."""
+        """Join neighbouring moves where moving together is free as well."""
         moves: list[dict[str, float]] = []
         moved: dict[str, float] = {}
         for axis, value in way:

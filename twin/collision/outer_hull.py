@@ -16,17 +16,17 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.description import MAX_POINTS
 
 MAX_PLANES: Final = 2000
-"""Of the points' hull that are looked at; any of them are right."""
-CLOSE_MM: Final = 0.01
-"""What stands out less is not cut off."""
-AT_ONCE: Final = 8
-"""Planes that cut corners off at a time."""
-LIFT: Final = 1e-9
-"""By what part of its size the body is larger, so that rounding leaves no point outside."""
+"""Largest number of planes of the points' hull that are used; any of them are valid."""
+MIN_CUT_MM: Final = 0.01
+"""Corners that stand out less are not cut off [mm]."""
+PLANES_PER_CUT: Final = 8
+"""Number of planes added at a time."""
+RELATIVE_LIFT: Final = 1e-9
+"""Enlargement of the body, as a part of its size, so that rounding leaves no point outside."""
 
 
 def outer_hull(points: npt.ArrayLike) -> Polytope:
-    """A convex body that contains points and has at most `MAX_POINTS` corners.
+    """Build a convex body that contains points and has at most `MAX_POINTS` corners.
 
     Args:
         points: (k, 3) [mm].
@@ -43,7 +43,7 @@ def outer_hull(points: npt.ArrayLike) -> Polytope:
         return exact
     planes = _planes(exact)
     low, high = exact.bounds()
-    lift = LIFT * float((high - low).max())
+    lift = RELATIVE_LIFT * float((high - low).max())
     inside = exact.vertices.mean(axis=0)
     chosen = [np.concatenate([s * e, [-float((s * exact.vertices @ e).max()) - lift]])
               for e in np.eye(3) for s in (-1.0, 1.0)]  # fmt: skip
@@ -51,7 +51,7 @@ def outer_hull(points: npt.ArrayLike) -> Polytope:
     while True:
         out = corners @ planes[:, :3].T + planes[:, 3]
         far, taken = out.max(axis=1), list[int]()
-        while far.max() > CLOSE_MM and len(taken) < AT_ONCE:
+        while far.max() > MIN_CUT_MM and len(taken) < PLANES_PER_CUT:
             taken.append(int(np.argmax(out[np.argmax(far)])))
             far[out[:, taken[-1]] > 0.0] = 0.0  # what a plane cuts off needs no second one
         chosen += list(planes[taken] - [0.0, 0.0, 0.0, lift])
@@ -62,7 +62,7 @@ def outer_hull(points: npt.ArrayLike) -> Polytope:
 
 
 def _planes(solid: Polytope) -> FloatArray:
-    """Outward planes (m, 4) of its largest faces: n . x + d <= 0 inside."""
+    """Compute outward planes (m, 4) of the solid's largest faces: n . x + d <= 0 inside."""
     a, b, c = np.moveaxis(solid.vertices[solid.faces], 1, 0)
     normals = np.cross(b - a, c - a)
     areas = np.linalg.norm(normals, axis=1)
@@ -78,6 +78,7 @@ def _planes(solid: Polytope) -> FloatArray:
 
 
 def _corners(planes: list[FloatArray], inside: FloatArray) -> FloatArray:
+    """Compute the corners (k, 3) of the body that planes bound around a point `inside`."""
     from scipy.spatial import HalfspaceIntersection
 
     found = HalfspaceIntersection(np.array(planes), inside).intersections

@@ -27,21 +27,22 @@ from flexdt.twin.script.planning.plan import ScanPlan
 from flexdt.twin.script.planning.plan_values import SampleSize
 
 MAX_CONTACTS = 20
-"""Contacts of one pair that are listed; a scan that hits every turn needs no more to be wrong."""
+"""Largest number of contacts of one pair that are listed."""
 MAX_LOOKS_IN_CONTACT = 500
-"""Places at which a pair in contact is looked at for being free again."""
+"""Number of places at which a pair in contact is examined for being free again."""
 TRACE_POINTS = 120
+"""Number of points of the clearance plot."""
 
 
 def collision_check(
     sample: Sequence[ConvexSolid] | None = None, parameters: Offsets = NOMINAL
 ) -> CollisionCheck:
-    """A check for `check_script(..., collision=...)`.
+    """Make a check for `check_script(..., collision=...)`.
 
     Args:
-        sample: convex pieces in the object's frame (see `convex_pieces`). None: the cylinder that
-            the script or the caller says holds the sample (as high as it is wide, where the height
-            is unknown), or an empty stage.
+        sample: convex pieces in the object's frame (see `convex_pieces`). None: the
+            cylinder that the script or the caller says holds the sample (as high as it is
+            wide, where the height is unknown), or an empty stage.
         parameters: the correction in force.
     """
 
@@ -55,7 +56,7 @@ def collision_check(
 
 
 def collision_report(plan: ScanPlan, scene: CollisionScene) -> Clearance:
-    """Contacts and clearances of a plan.
+    """Sweep a plan for its contacts and clearances.
 
     Args:
         plan: what would run.
@@ -77,6 +78,7 @@ def collision_report(plan: ScanPlan, scene: CollisionScene) -> Clearance:
 
 
 def _least(search: PathSearch, contacts: Sequence[Contact]) -> tuple[float, tuple[str, str] | None]:
+    """Find the least clearance [mm] and its pair; with contacts, those of the worst."""
     if contacts:
         worst = min(contacts, key=lambda c: c.clearance_mm)
         return worst.clearance_mm, worst.pair
@@ -85,6 +87,7 @@ def _least(search: PathSearch, contacts: Sequence[Contact]) -> tuple[float, tupl
 
 
 def _from_size(size: SampleSize | None) -> tuple[ConvexSolid, ...]:
+    """Make the cylinder of a sample's size; no body without one."""
     if size is None or size.diameter_mm <= 0.0:
         return ()
     height = size.height_mm or size.diameter_mm
@@ -92,7 +95,7 @@ def _from_size(size: SampleSize | None) -> tuple[ConvexSolid, ...]:
 
 
 def _contacts(search: PathSearch) -> list[Contact]:
-    """All contacts, in the order of time; of several pieces of a sample, the first."""
+    """Find all contacts, in the order of time; of several pieces of a sample, the first."""
     limits = search.scene.limits
     found = []
     for k, bound in enumerate(search.bounds):
@@ -108,7 +111,7 @@ def _contacts(search: PathSearch) -> list[Contact]:
 
 
 def _contacts_of(search: PathSearch, k: int) -> list[Contact]:
-    """Contacts of one pair: after each it must come free again to count anew."""
+    """Find the contacts of one pair; after each it must come free before it counts again."""
     motion, limits = search.motion(k), search.scene.limits
     separate = search.scene.separation(search.pairs[k])
     out: list[Contact] = []
@@ -129,7 +132,7 @@ def _contacts_of(search: PathSearch, k: int) -> list[Contact]:
 
 
 def _line(plan: ScanPlan, scene: CollisionScene, contact: Contact) -> int:
-    """The line of the last motion command under way at the contact that moves one of the two."""
+    """Find the line of the last motion under way at the contact that moves one of the two."""
     pairs = [scene.names(pair) == contact.pair for pair in scene.all.pairs]
     motors = {scene.axes[i] for i in np.flatnonzero(scene.all.moves[pairs].any(axis=0))}
     under_way = [
@@ -146,7 +149,7 @@ def _line(plan: ScanPlan, scene: CollisionScene, contact: Contact) -> int:
 
 
 def _trace_times(path: Path, count: int) -> FloatArray:
-    """Times for a plot: spread over the motion, not over the pauses between."""
+    """Choose `count` times for a plot: spread over the motion, not over the pauses between."""
     travelled = np.abs(np.diff(path.q, axis=0)).sum(axis=1)
     along = np.concatenate([[0.0], np.cumsum(travelled)])
     if along[-1] == 0.0 or count < 2:

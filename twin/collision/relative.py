@@ -35,23 +35,23 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.motion.profiles import AxisPath
 from flexdt.twin.scanner.safety import ROUNDING_MM, floor
 
-CONTINUITY = 1e-6
+JUMP_TOLERANCE = 1e-6
 """Largest jump of a motor between two pieces that counts as rounding [mm, deg]."""
 
 
-STEPS_OF_TIME = 8.0
-"""How many of the smallest steps of a time count as its rounding."""
-ROUNDING = 1e-9
-"""Shortest time that counts as a segment of its own where a motor turns round [s]."""
+TIME_ROUNDING_SPACINGS = 8.0
+"""Rounding of a time, in units of its floating-point spacing."""
+MIN_SEGMENT_S = 1e-9
+"""Shortest segment that begins where a motor reverses [s]."""
 Separate = Callable[[FloatArray, FloatArray | None, FloatArray | None], Separation]
 """The certified clearance of two solids: from b's origin to a's, orientations of a and b."""
 Kept = slice | npt.NDArray[np.intp]
-"""Which segments of a path matter."""
+"""Selection of a path's segments."""
 
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """Every motor over time.
+    """Positions of every motor over time.
 
     Attributes:
         axes: names of the motors, in the order of the columns.
@@ -68,18 +68,18 @@ class Path:
     a: FloatArray
 
     def vectors(self, times: FloatArray) -> FloatArray:
-        """Positions at `times` (n,) within the path, (n, axes)."""
+        """Compute positions at `times` (n,) within the path, (n, axes)."""
         i = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.v) - 1)
         dt = np.clip(times - self.times[i], 0.0, self.times[i + 1] - self.times[i])[:, None]
         at = self.q[i] + dt * (self.v[i] + 0.5 * dt * self.a[i])
         return np.where((times >= self.times[-1])[:, None], self.q[-1], at)
 
     def positions(self, time: float) -> dict[str, float]:
-        """Motor -> position at `time` within the path [mm, deg]."""
+        """Compute motor -> position at `time` within the path [mm, deg]."""
         return dict(zip(self.axes, self.vectors(np.array([time]))[0].tolist(), strict=True))
 
     def after(self, time: float) -> Path:
-        """What is left of it from `time` on, which lies before its end."""
+        """Return the rest of the path from `time` on, which is before its end."""
         later = self.times > time
         first = max(0, int(np.argmax(later)) - 1)
         dt = time - self.times[first]
@@ -97,7 +97,7 @@ class Path:
 
 
 def path_of(axes: Sequence[str], tables: Mapping[str, AxisPath], start: float, end: float) -> Path:
-    """The path of `axes` from `start` to `end` [s].
+    """Make the path of `axes` from `start` to `end` [s].
 
     Raises:
         KeyError: a motor has no table.
@@ -124,7 +124,7 @@ def path_of(axes: Sequence[str], tables: Mapping[str, AxisPath], start: float, e
         # The times themselves are rounded, also those of a programme that is slowed: its places are
         # off by what the motor goes before it is. A clock that is late has coarse ones.
         rounding = coarseness(begin[1:]) * float(np.abs(table.v).max())
-        jumps = np.abs(arrives[:-1] - x0[1:]) > CONTINUITY + rounding
+        jumps = np.abs(arrives[:-1] - x0[1:]) > JUMP_TOLERANCE + rounding
         if jumps.any():
             where = int(np.argmax(jumps))
             raise ValueError(
@@ -136,16 +136,17 @@ def path_of(axes: Sequence[str], tables: Mapping[str, AxisPath], start: float, e
 
 
 def coarseness(times: FloatArray) -> FloatArray:
-    """How far times of that size may be off by rounding [s]."""
-    return STEPS_OF_TIME * np.asarray(np.spacing(np.abs(times)))
+    """Compute how far times of that size may be off by rounding [s]."""
+    return TIME_ROUNDING_SPACINGS * np.asarray(np.spacing(np.abs(times)))
 
 
 def _stands(table: AxisPath) -> bool:
+    """Return whether a motor never moves."""
     return not (table.v.any() or table.a.any() or (table.x != table.x[0]).any())
 
 
 def _state(table: AxisPath, times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Position, velocity, acceleration in force from each of `times` (in order) on."""
+    """Compute position, velocity, acceleration in force from each of `times` (in order) on."""
     i = table.times.searchsorted(times, side="right") - 1
     before, i = i < 0, np.maximum(i, 0)  # there it stands
     dt, v0, a0 = np.where(before, 0.0, (times - table.times[i], table.v[i], table.a[i]))
@@ -154,14 +155,14 @@ def _state(table: AxisPath, times: FloatArray) -> tuple[FloatArray, FloatArray, 
 
 
 def _turning_times(table: AxisPath) -> FloatArray:
-    """When the motor turns round within a piece."""
+    """Find the times at which the motor reverses within a piece."""
     turning = table.v * table.a < 0.0
     if not turning.any():
         return table.times[:0]
     at = table.times[turning] - table.v[turning] / table.a[turning]
     # A piece that brakes to rest turns round where it ends; rounding must not cut it there.
     ends = np.append(table.times[1:], np.inf)[turning]
-    return np.asarray(at[at < ends - ROUNDING])
+    return np.asarray(at[at < ends - MIN_SEGMENT_S])
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,11 +174,13 @@ class Moment:
 
 
 START = Moment(0, 0.0)
+"""The first moment of a relative motion."""
 
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """A distance evaluation: when, the certified gap [mm], its direction from b to a, the turns."""
+    """One distance evaluation: moment, certified gap [mm], its direction from b to a,
+    orientations."""
 
     at: Moment
     gap: float
@@ -193,12 +196,14 @@ class _Bound:
     growth: FloatArray
 
     def less(self, other: _Bound, factor: float) -> _Bound:
+        """Subtract `factor` times another bound."""
         return _Bound(self.rate - factor * other.rate, self.growth - factor * other.growth)
 
     def first_fall(
         self, at: Moment, lengths: FloatArray, value: float, level: float
     ) -> Moment | None:
-        """The first moment from `at` on at which it, being `value` there, reaches `level`."""
+        """Find the first moment from `at` on at which the bound, being `value` there,
+        reaches `level`."""
         lengths = lengths[at.segment :].copy()
         lengths[0] -= at.dt
         rate, growth = self.rate[at.segment :].copy(), self.growth[at.segment :]
@@ -219,7 +224,8 @@ class _Bound:
 
 
 def _fall_time(above: float, rate: float, growth: float, length: float) -> float | None:
-    """First dt in [0, length] at which above + rate dt + growth dt^2 / 2 is 0, or None."""
+    """Solve for the first dt in [0, length] at which above + rate dt + growth dt^2 / 2 is
+    0, or None."""
     if above <= 0.0:
         return 0.0
     square = rate * rate - 2.0 * growth * above
@@ -245,15 +251,23 @@ class _Turn:
     acceleration: FloatArray
     nearing: _Bound
     sense: float
-    """Of all turns; 0 if they differ."""
+    """Sign of all turns; 0 if they differ."""
 
     @classmethod
     def of(cls, body: Body, side: float, path: Path, kept: Kept) -> _Turn:
+        """Evaluate the turning of a body over the segments of a path.
+
+        Args:
+            body: that turns.
+            side: -1 for a, +1 for b.
+            path: all motors.
+            kept: segments that matter.
+        """
         angle, rate, growth = path.q[:-1] @ body.turns, path.v @ body.turns, path.a @ body.turns
         after = rate + growth * np.diff(path.times)
         # A path is cut where a motor turns round. There rounding may leave a velocity that still
         # points the old way; the acceleration tells.
-        rounding = np.abs(growth) * (ROUNDING + coarseness(path.times[:-1]))
+        rounding = np.abs(growth) * (MIN_SEGMENT_S + coarseness(path.times[:-1]))
         signs = np.sign(np.where(np.abs(rate) > rounding, rate, growth))
         # What several turntables carry may turn round within a segment: it turns no faster there.
         both = (rate * after < 0.0) & (np.minimum(np.abs(rate), np.abs(after)) > rounding)
@@ -266,26 +280,29 @@ class _Turn:
         return cls(body, side, angle[kept], rate[kept], growth[kept], nearing, sense)
 
     def orientation(self, at: Moment) -> FloatArray:
+        """Compute the body's orientation at a moment, (3, 3)."""
         i, dt = at.segment, at.dt
         angle = self.angle[i] + dt * (self.rate[i] + 0.5 * dt * self.acceleration[i])
         return self.body.rotation(float(angle))
 
     @cached_property
     def turns(self) -> bool:
-        """Whether it turns at all."""
+        """Whether the body turns at all."""
         return bool(self.rate.any() or self.acceleration.any())
 
     @cached_property
     def left(self) -> _Bound:
-        """A turn that is used up."""
+        """Bound that falls as a turn is used up."""
         return _Bound(-self.nearing.rate, -self.nearing.growth)
 
     def lever(
         self, normal: FloatArray, orientation: FloatArray, allowance: float
     ) -> tuple[float, float]:
-        """(mm per rad, rad): within that turn the solid comes no nearer than that, per radian.
+        """Compute (mm per rad, rad): within that turn the solid approaches by no more per
+        radian.
 
-        The nearing along a fixed normal is a convex function of the turn, so a chord is a bound.
+        The nearing along a fixed normal is a convex function of the turn, so a chord is a
+        bound.
         """
         along = float(normal @ self.body.spin_axis)
         crude = self.body.reach * math.sqrt(max(0.0, 1.0 - along * along))
@@ -325,7 +342,8 @@ class RelativeMotion:
         self._leave_out_repeated_turns()
 
     def _leave_out_repeated_turns(self) -> None:
-        """Where one body turns evenly on the spot, every turn after the first meets what it met.
+        """Shorten segments in which one body turns evenly in place: later turns repeat
+        the first.
 
         Whole turns are taken out of such segments, so they end in the pose they ended in.
         """
@@ -341,11 +359,11 @@ class RelativeMotion:
         return len(self.times)
 
     def time(self, at: Moment) -> float:
-        """Time of `at` [s]."""
+        """Return the time of `at` [s]."""
         return float(self.times[at.segment] + at.dt)
 
     def look(self, at: Moment, separate: Separate) -> Look:
-        """Separate the two bodies at a moment."""
+        """Compute the certified gap of the two bodies at a moment."""
         i, dt = at.segment, at.dt
         offset = self._origin[i] + dt * (self._velocity[i] + 0.5 * dt * self._acceleration[i])
         turn_a = None if self._turn_a is None else self._turn_a.orientation(at)
@@ -354,7 +372,7 @@ class RelativeMotion:
         return Look(at, gap, normal, (turn_a, turn_b))
 
     def next_at(self, look: Look, level: float) -> Moment | None:
-        """First moment after a look at which the gap may have fallen to `level` [mm].
+        """Find the first moment after a look at which the gap may have fallen to `level` [mm].
 
         `level` is below the look's gap. None if the gap stays above it to the end.
         """
@@ -374,16 +392,17 @@ class RelativeMotion:
         )
 
     def after_travel(self, at: Moment, distance: float) -> Moment | None:
-        """The first moment after `at` by which a gap may have grown by `distance` [mm].
+        """Find the first moment after `at` by which a gap may have grown by `distance` [mm].
 
-        Two points of the bodies move apart no faster than the origins slide and the farthest
-        points turn. None if they travel less to the end.
+        Two points of the bodies move apart no faster than the origins slide and the
+        farthest points turn. None if they travel less to the end.
         """
         return self._travel.first_fall(at, self.lengths, distance, 0.0)
 
     @cached_property
     def _travel(self) -> _Bound:
-        """Travel that is used up. Speeds are convex in a segment: the chord is a bound."""
+        """Bound that falls as travel is used up. Speeds are convex in a segment: the
+        chord is a bound."""
         lengths = self.lengths[:, None]
         begin = np.linalg.norm(self._velocity, axis=1)
         end = np.linalg.norm(self._velocity + self._acceleration * lengths, axis=1)
@@ -395,7 +414,8 @@ class RelativeMotion:
         return _Bound(-begin, -growth)
 
     def nearest_end(self, look: Look) -> Moment:
-        """The segment end after a look that lies farthest towards b along its normal, unturned."""
+        """Find the segment end after a look that is farthest towards b along its normal,
+        unturned."""
         i = look.at.segment
         slide, lengths = self._slide(look.normal), self.lengths[i:]
         change = lengths * (slide.rate[i:] + 0.5 * slide.growth[i:] * lengths)
@@ -403,18 +423,19 @@ class RelativeMotion:
         return Moment(j, float(self.lengths[j]))
 
     def _slide(self, normal: FloatArray) -> _Bound:
+        """Project the sliding of a on a direction."""
         return _Bound(self._velocity @ normal, self._acceleration @ normal)
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What counts as a contact, and how well the least clearance is wanted [mm].
+    """Definition of a contact, and the accuracy of the least clearance [mm].
 
     Attributes:
         margin: clearance that is kept.
         tolerance: a gap within this of the margin is a contact.
-        accuracy: absolute [mm] and relative error allowed in the least clearance (it is never
-            reported smaller than it is).
+        accuracy: absolute [mm] and relative error allowed in the least clearance (it is
+            never reported smaller than it is).
     """
 
     margin: float
@@ -422,13 +443,13 @@ class Limits:
     accuracy: tuple[float, float]
 
     def slack(self, clearance: float) -> float:
-        """Error allowed in a least clearance of this size."""
+        """Return the error allowed in a least clearance of this size [mm]."""
         return max(self.accuracy[0], self.accuracy[1] * clearance)
 
 
 @dataclass(frozen=True)
 class PairResult:
-    """What one pair's sweep found.
+    """Result of the sweep of one pair.
 
     Attributes:
         least: smallest clearance looked at before the contact, or at it [mm].
@@ -451,10 +472,10 @@ def sweep_pair(
     start: Moment = START,
     until: float = math.inf,
 ) -> PairResult:
-    """Follow one pair until it touches, the motion ends, or `until` [s].
+    """Sweep one pair until it touches, the motion ends, or `until` [s].
 
-    A pair that starts within the tolerance of the margin, or nearer, may move, but not below its
-    floor.
+    A pair that starts within the tolerance of the margin, or nearer, may move, but not
+    below its floor.
 
     Args:
         motion: of one body relative to the other.
@@ -494,10 +515,12 @@ def sweep_pair(
 def refine_pair(
     motion: RelativeMotion, separate: Separate, limits: Limits, best: float
 ) -> tuple[float, int]:
-    """Least clearance of a pair that is known to be free, if it is below `best` [mm].
+    """Refine the least clearance of a pair that is known to be free, if it is below
+    `best` [mm].
 
     Returns:
-        A clearance that occurs, not more than `limits.slack` above the least (`best` if nothing
+        A clearance that occurs, not more than `limits.slack` above the least (`best` if
+        nothing
         is below that), and the number of evaluations.
     """
     at: Moment | None = START
@@ -514,7 +537,7 @@ def refine_pair(
 
 
 def _last_free(motion: RelativeMotion, before: Look, wanted: float) -> Moment:
-    """The last moment known to have clearance `wanted`, or the last one looked at."""
+    """Find the last moment known to have clearance `wanted`, or the last one evaluated."""
     if before.gap <= wanted:
         return before.at
     return motion.next_at(before, wanted) or before.at

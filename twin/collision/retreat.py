@@ -38,18 +38,20 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.scanner.safety import ROUNDING_MM, Contact, floor
 
 GRAZING_MM = 1e-3
-"""Pairs this near are judged as overlapping ones: their direction is rounding in a sweep."""
-STANDING = 1e-12
-"""What rounding makes of an orientation that has not changed."""
-MANY = 100
-"""Corners of a body beyond which not all of their directions are looked at (a mesh has thousands,
-and the directions of a pair grow with the product): some, and the best one, refined."""
-REFINEMENTS = 40
-"""Halvings of the step in which the direction of a round body's least overlap is looked for."""
+"""Pairs this near are judged as overlapping: their direction is rounding in a sweep [mm]."""
+ORIENTATION_ROUNDING = 1e-12
+"""Largest change of an orientation that is rounding."""
+MAX_EXACT_CORNERS = 100
+"""Corners of a body beyond which only some of their directions are used, the best one refined.
+
+A mesh has thousands, and the directions of a pair grow with the product.
+"""
+REFINEMENT_STEPS = 40
+"""Steps of the search for the direction of a round body's least overlap."""
 
 
 def leaving(scene: CollisionScene, path: Path) -> Contact | None:
-    """The first contact of a motion that begins with bodies overlapping, or None.
+    """Find the first contact of a motion that begins with bodies overlapping, or None.
 
     Args:
         scene: what may touch what.
@@ -63,7 +65,8 @@ def leaving(scene: CollisionScene, path: Path) -> Contact | None:
 
 
 def _of_pair(scene: CollisionScene, path: Path, pair: Pair) -> Contact | None:
-    """What stops one overlapping pair: coming closer, or touching again once free."""
+    """Find the contact that stops one overlapping pair: coming closer, or touching again
+    once free."""
     a, b = (scene.bodies[i] for i in pair)
     motion, overlap = RelativeMotion(a, b, path), _Overlap.at(a, b, path.q[0])
     deeper = _deeper(motion, overlap, scene.limits.margin)
@@ -82,7 +85,8 @@ def _of_pair(scene: CollisionScene, path: Path, pair: Pair) -> Contact | None:
 def _deeper(
     motion: RelativeMotion, overlap: _Overlap, margin: float
 ) -> tuple[Moment, Moment] | None:
-    """When the separation comes down to its floor, after the last look before; None for never."""
+    """Find when the separation falls to its floor: (last look before, moment); None for
+    never."""
     look = motion.look(START, overlap.separate)
     level = floor(look.gap, margin)
     while (at := motion.next_at(look, level)) is not None:
@@ -95,10 +99,11 @@ def _deeper(
 def _free_from(
     motion: RelativeMotion, separate: Separate, limits: Limits, until: float
 ) -> float | None:
-    """When the two are clear of the margin by twice the tolerance, before `until`; else None [s].
+    """Find when the two exceed the margin by twice the tolerance, before `until`; else
+    None [s].
 
-    Where they are not clear by one tolerance, the other one has yet to be travelled, so that every
-    look is that far from the one before.
+    Where they are not clear by one tolerance, the other one has yet to be travelled, so
+    that every look is that far from the one before.
     """
     at: Moment | None = START
     while at is not None and motion.time(at) < until:
@@ -110,6 +115,7 @@ def _free_from(
 
 
 def _without(scene: CollisionScene, pairs: list[Pair]) -> CollisionScene:
+    """Remove pairs from a scene."""
     left_out = set(pairs)
     return replace(
         scene,
@@ -120,12 +126,14 @@ def _without(scene: CollisionScene, pairs: list[Pair]) -> CollisionScene:
 
 @dataclass(frozen=True, eq=False)
 class _Overlap:
-    """Two bodies that overlap at the beginning, and the directions across which they may part.
+    """Two bodies that overlap at the beginning, and the directions across which they may
+    separate.
 
     Attributes:
         bodies: the two.
         turned: their orientations at the beginning, (3, 3) each.
-        directions: (k, 3) unit directions in the world then, from the second to the first.
+        directions: (k, 3) unit directions in the world then, from the second to the
+            first.
     """
 
     bodies: tuple[Body, Body]
@@ -134,7 +142,7 @@ class _Overlap:
 
     @classmethod
     def at(cls, a: Body, b: Body, q: FloatArray) -> _Overlap:
-        """The overlap with the motors at `q` (axes,)."""
+        """Find the directions of an overlap with the motors at `q` (axes,)."""
         from scipy.spatial import ConvexHull
 
         (turn_a, at_a), (turn_b, at_b) = _pose(a, q), _pose(b, q)
@@ -148,28 +156,30 @@ class _Overlap:
 
     @cached_property
     def _reach(self) -> tuple[FloatArray, FloatArray]:
-        """(k,) each: how far either body reaches across the directions that turn with it [mm]."""
+        """Extents of either body across the directions that turn with it, (k,) each [mm]."""
         first, second = (self._reach_of(i, self.directions, self.turned) for i in (0, 1))
         return first, second
 
     def _reach_of(
         self, i: int, directions: FloatArray, turned: tuple[FloatArray, FloatArray]
     ) -> FloatArray:
+        """Compute how far body `i` extends towards the other across directions, (k,) [mm]."""
         towards = directions if i else -directions
         return self.bodies[i].solid.support(towards @ turned[i])
 
     def separate(
         self, offset: FloatArray, turn_a: FloatArray | None, turn_b: FloatArray | None
     ) -> Separation:
-        """Width of the widest slab between them [mm] and its direction, as `relative.Separate`.
+        """Compute the widest slab between the bodies [mm] and its direction, as
+        `relative.Separate`.
 
-        The width is negative for an overlap, and never too large. Looked at are directions that
-        turn with either body. How far that body reaches across them does not change, so that one
-        of many corners costs no more than another.
+        The width is negative for an overlap, and never too large. Looked at are
+        directions that turn with either body. How far that body reaches across them does
+        not change, so that one of many corners costs no more than another.
         """
         turned = (np.eye(3) if turn_a is None else turn_a, np.eye(3) if turn_b is None else turn_b)
         off = (np.abs(now - then).max() for now, then in zip(turned, self.turned, strict=True))
-        turns = max(off) > STANDING
+        turns = max(off) > ORIENTATION_ROUNDING
         widest, across = -math.inf, self.directions[0]
         for i in (0, 1) if turns else (0,):
             if turns and _many(self.bodies[1 - i].solid):
@@ -183,12 +193,12 @@ class _Overlap:
         return widest, across
 
     def separation(self, q: FloatArray) -> float:
-        """That width with the motors at `q` (axes,) [mm]."""
+        """Compute that width with the motors at `q` (axes,) [mm]."""
         (turn_a, at_a), (turn_b, at_b) = (_pose(body, q) for body in self.bodies)
         return self.separate(at_a - at_b, turn_a, turn_b)[0]
 
     def _refined(self, q: FloatArray) -> FloatArray:
-        """(1, 3): the direction of the widest gap, where no faces tell it exactly."""
+        """Search for the direction (1, 3) of the widest gap, where no faces give it exactly."""
         (_, at_a), (_, at_b) = (_pose(body, q) for body in self.bodies)
 
         def gaps(directions: FloatArray) -> FloatArray:
@@ -197,7 +207,7 @@ class _Overlap:
 
         best = self.directions[int(np.argmax(gaps(self.directions)))]
         step = 0.1
-        for _ in range(REFINEMENTS):
+        for _ in range(REFINEMENT_STEPS):
             around = np.vstack([best, best + step * np.eye(3), best - step * np.eye(3)])
             around /= np.linalg.norm(around, axis=1)[:, None]
             widest = int(np.argmax(gaps(around)))
@@ -207,18 +217,20 @@ class _Overlap:
 
 
 def _pose(body: Body, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Compute a body's orientation (3, 3) and origin (3,) [mm] with the motors at `q`."""
     turn = body.rotation(float(q @ body.turns)) if body.spins else np.eye(3)
     return turn, q @ body.slides + body.origin
 
 
 def _many(solid: ConvexSolid) -> bool:
-    return isinstance(solid, Polytope) and len(solid.vertices) > MANY
+    """Return whether a solid has too many corners to use all."""
+    return isinstance(solid, Polytope) and len(solid.vertices) > MAX_EXACT_CORNERS
 
 
 def _corners(solid: ConvexSolid) -> FloatArray:
-    """(k, 3): corners of a body, of one with very many only some."""
+    """Return corners of a body (k, 3), of one with very many only some."""
     if _many(solid):
-        ways = np.random.default_rng(0).normal(size=(MANY, 3))
+        ways = np.random.default_rng(0).normal(size=(MAX_EXACT_CORNERS, 3))
         return np.unique(solid.farthest(ways), axis=0)
     upright = solid.prism() if isinstance(solid, UprightCylinder) else solid
     assert isinstance(upright, Polytope)

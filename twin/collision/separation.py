@@ -22,20 +22,22 @@ Separation = tuple[float, FloatArray]
 
 _IDENTITY = np.eye(3)
 _ORIGIN = np.zeros(3)
-_NOWHERE: Separation = (0.0, np.array([0.0, 0.0, 1.0]))
-DOUBT = 1e-5
-"""A certificate this far below the distance [mm] is as good as exact."""
-ROUNDS = 40
-"""Most corners of the hull of all differences that the search for the nearest point takes up."""
+_TOUCHING: Separation = (0.0, np.array([0.0, 0.0, 1.0]))
+"""Separation of bodies that touch or overlap."""
+MAX_DEFICIT_MM = 1e-5
+"""Largest deficit of a certificate from fcl's distance before the search improves it [mm]."""
+MAX_SEARCH_STEPS = 40
+"""Largest number of steps of Gilbert's search."""
 
 
 def separation_of(
     a: ConvexSolid, b: ConvexSolid
 ) -> Callable[[FloatArray, FloatArray | None, FloatArray | None], Separation]:
-    """A function that separates `a` from `b`.
+    """Make a function that computes the certified separation of `a` from `b`.
 
     Returns:
-        A function of the vector from b's origin to a's (3,) [mm] and of the orientations of a and
+        A function of the vector from b's origin to a's (3,) [mm] and of the orientations
+        of a and
         b (3, 3), None for a body that never turns.
     """
     import fcl
@@ -48,6 +50,7 @@ def separation_of(
     def separate(
         offset: FloatArray, turn_a: FloatArray | None, turn_b: FloatArray | None
     ) -> Separation:
+        """Separate the two solids in a pose; thread-safe."""
         # Nothing is shared that changes: several threads may ask at once.
         ra, rb = (_IDENTITY if turn is None else turn for turn in (turn_a, turn_b))
         object_a = fcl.CollisionObject(shape_a, fcl.Transform(ra, offset + ra @ shift_a))
@@ -57,18 +60,18 @@ def separation_of(
         result = fcl.DistanceResult()
         distance = fcl.distance(object_a, object_b, request, result)
         if not distance > 0.0:
-            return _NOWHERE
+            return _TOUCHING
         on_a, on_b = result.nearest_points
         apart = on_a - on_b
         length = math.sqrt(apart @ apart)
         if length == 0.0:
-            return _NOWHERE
+            return _TOUCHING
         normal = apart / length
         # The empty slab across the normal: no two points are nearer than it is wide.
         gap = float(normal @ offset - a.support(-normal @ ra) - b.support(normal @ rb))
-        if gap < distance - DOUBT:
+        if gap < distance - MAX_DEFICIT_MM:
             gap, normal = _improved(a, b, (gap, normal), offset, ra, rb)
-        return (gap, normal) if gap > 0.0 else _NOWHERE
+        return (gap, normal) if gap > 0.0 else _TOUCHING
 
     return separate
 
@@ -81,14 +84,21 @@ def _improved(
     ra: FloatArray,
     rb: FloatArray,
 ) -> Separation:
-    """The certificate across the nearest point of the hull of all differences (Gilbert's search).
+    """Improve a certificate by Gilbert's search for the nearest point of the hull of all
+    differences.
 
     fcl is off by millimetres where two edges are parallel, as those of upright boxes are.
+
+    Args:
+        a, b: the solids.
+        found: certificate to improve.
+        offset: from b's origin to a's (3,) [mm].
+        ra, rb: orientations of a and b (3, 3).
     """
     from scipy.optimize import nnls
 
     normal, corners = found[1], []
-    for _ in range(ROUNDS):
+    for _ in range(MAX_SEARCH_STEPS):
         corners.append(offset + ra @ a.farthest(-normal @ ra) - rb @ b.farthest(normal @ rb))
         found = max(found, (float(normal @ corners[-1]), normal), key=lambda f: f[0])
         # The hull's point nearest to the origin: least squares with weights that add up to one.
@@ -100,14 +110,14 @@ def _improved(
             break
         nearest = points @ weights / weights.sum()
         length = math.sqrt(nearest @ nearest)
-        if length - max(found[0], 0.0) < DOUBT:
+        if length - max(found[0], 0.0) < MAX_DEFICIT_MM:
             break
         normal = nearest / length
     return found
 
 
 def _as_fcl(solid: ConvexSolid) -> tuple[Any, FloatArray]:
-    """fcl's shape and where its own centre lies in the solid's frame."""
+    """Make fcl's shape, and its own centre in the solid's frame (3,) [mm]."""
     import fcl
 
     match solid:

@@ -39,7 +39,7 @@ from flexdt.twin.machine.description import SAMPLE, Component, Machine, Profile
 DOWN = np.array([0.0, 0.0, -1.0])
 """The stage's axis, so that growing angles turn clockwise seen from above."""
 TINY = 1e-300
-"""Keeps a quotient finite."""
+"""Added to a denominator to keep a quotient finite."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +69,8 @@ class Body:
 
     @cached_property
     def reach(self) -> float:
-        """Farthest point from the line it turns about [mm]; 0 where turning changes nothing."""
+        """Largest distance of a point from the spin axis [mm]; 0 where turning changes
+        nothing."""
         if not self.turns.any() or self.solid.is_round(self.spin_axis):
             return 0.0
         return self.solid.radius_about(self.spin_axis)
@@ -93,7 +94,8 @@ class Body:
         return ends.min(axis=0) - across, ends.max(axis=0) + across
 
     def turn_until(self, toward: FloatArray, allowance: float, sense: float) -> float:
-        """How far it may turn before its support along `toward` grows by `allowance` [rad].
+        """Compute how far the body may turn before its support along `toward` grows by
+        `allowance` [rad].
 
         Args:
             toward: (3,) unit direction in the body's turned frame.
@@ -117,27 +119,29 @@ class Body:
 
     @cached_property
     def _levers(self) -> FloatArray:
-        """Points, their swings about the axis, and their distances from it, stacked (3 k, 3)."""
+        """Points, their velocities about the axis, and their distances from it, stacked
+        (3 k, 3)."""
         points = self.solid.vertices if isinstance(self.solid, Polytope) else np.empty((0, 3))
         inner = points - np.outer(points @ self.spin_axis, self.spin_axis)
         return np.concatenate([points, np.cross(self.spin_axis, points), inner])
 
     @cached_property
     def _rodrigues(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Matrices of Rodrigues' formula: along the axis, across it, cross product."""
         x, y, z = self.spin_axis
         cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
         along = np.outer(self.spin_axis, self.spin_axis)
         return along, np.eye(3) - along, cross
 
     def rotation(self, angle: float) -> FloatArray:
-        """Orientation at spin angle `angle` [rad], (3, 3)."""
+        """Compute the orientation at spin angle `angle` [rad], (3, 3)."""
         along, across, cross = self._rodrigues
         turned: FloatArray = along + math.cos(angle) * across + math.sin(angle) * cross
         return turned
 
 
 def stage_bodies(machine: Machine, profile: Profile, parameters: Offsets = NOMINAL) -> list[Body]:
-    """The components as bodies.
+    """Place the components of a machine as bodies.
 
     Args:
         machine: its components and its linear map.
@@ -157,10 +161,11 @@ def stage_bodies(machine: Machine, profile: Profile, parameters: Offsets = NOMIN
 def sample_bodies(
     machine: Machine, profile: Profile, sample: Sequence[ConvexSolid], parameters: Offsets = NOMINAL
 ) -> list[Body]:
-    """The sample's pieces as bodies on the component whose role is `sample_holder`.
+    """Place the sample's pieces as bodies on the component whose role is `sample_holder`.
 
-    A point b of a piece stands at c + T R(alpha + angle_scale * angle) (b + mount - tau), the map
-    of `Poses.cone_vec`; a piece is as large as all that a stage on the turntable can sweep with it.
+    A point b of a piece stands at c + T R(alpha + angle_scale * angle) (b + mount - tau),
+    the map of `Poses.cone_vec`; a piece is as large as all that a stage on the turntable
+    can sweep with it.
     """
     holder = next((c for c in machine.components if c.role == "sample_holder"), None)
     if holder is None:
@@ -190,7 +195,7 @@ def sample_bodies(
 
 
 def _shifts(machine: Machine, profile: Profile, p: Offsets) -> dict[str, FloatArray]:
-    """Offset of each anchor from what the motors read (3,) [mm]."""
+    """Compute the offset of each anchor from the motors' readings (3,) [mm]."""
     tau = from_unity([p.tau_x, 0.0, p.tau_z])
     shifts = {
         "world": np.zeros(3),
@@ -214,13 +219,14 @@ def _wherever(
     solid: UprightCylinder | Polytope,
     place: FloatArray | None = None,
 ) -> ConvexSolid:
-    """`solid` with all places to which a stage on the turntable brings it.
+    """Enlarge `solid` to all places to which a stage on the turntable brings it.
 
     Args:
         machine: whose stage it is.
         part: the component, or the holder of a sample.
         solid: in the frame of the turntable.
-        place: of a sample, which is on top of every such stage: its turn on the turntable.
+        place: of a sample, which is on top of every such stage: its turn on the
+            turntable.
     """
     if part.anchor != "object":
         return solid
@@ -245,10 +251,11 @@ def _wherever(
 def _chain(
     machine: Machine, part: Component, shifts: Mapping[str, FloatArray]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Origin, slides and turns of a component's frame.
+    """Compute origin, slides and turns of a component's frame.
 
-    An offset belongs to the motor's reading, so it moves what the motor moves and no more; what is
-    fixed stands at its anchor, and what has a role where the X-ray geometry has it.
+    An offset belongs to the motor's reading, so it moves what the motor moves and no
+    more; what is fixed stands at its anchor, and what has a role where the X-ray geometry
+    has it.
     """
     chain = machine.chain(part)
     columns = {name: i for i, name in enumerate(machine.axes)}
@@ -269,6 +276,7 @@ def _chain(
 
 
 def _solid(part: Component, profile: Profile, p: Offsets) -> UprightCylinder | Polytope:
+    """Make the solid of a component; a panel follows its tilts."""
     if part.shape == "cylinder":
         return UprightCylinder(part.center_mm, 0.5 * part.size_mm[0], part.size_mm[2])
     solid = hull(part.points_mm) if part.points_mm else box(part.size_mm, part.center_mm)
@@ -279,7 +287,7 @@ def _solid(part: Component, profile: Profile, p: Offsets) -> UprightCylinder | P
 
 
 def _panel_turn(profile: Profile, p: Offsets) -> FloatArray:
-    """The panel's orientation, from the directions of its columns and rows."""
+    """Compute the panel's orientation (3, 3) from the directions of its columns and rows."""
     u, v = turn_detector(COLUMN_DIRECTION, ROW_DIRECTION, 0, 0, math.radians(profile.det_roll_deg))
     u, v = turn_detector(u, v, p.det_yaw, p.det_pitch, p.det_roll)
     upright = np.stack([COLUMN_DIRECTION, ROW_DIRECTION, np.cross(COLUMN_DIRECTION, ROW_DIRECTION)])
@@ -288,7 +296,7 @@ def _panel_turn(profile: Profile, p: Offsets) -> FloatArray:
 
 
 def _placed(piece: ConvexSolid, place: FloatArray, tau: FloatArray) -> UprightCylinder | Polytope:
-    """A piece moved by p -> place (p - tau)."""
+    """Move a piece by p -> place (p - tau)."""
     if not isinstance(piece, (UprightCylinder, Polytope)):
         raise TypeError(f"cannot place a {type(piece).__name__}")
     if not tau.any() and np.array_equal(place, np.eye(3)):
@@ -299,7 +307,7 @@ def _placed(piece: ConvexSolid, place: FloatArray, tau: FloatArray) -> UprightCy
 
 
 def _group(machine: Machine, part: Component) -> str:
-    """The topmost part that `part` is rigidly mounted on."""
+    """Return the topmost part that `part` is rigidly mounted on; "" for the world."""
     named = {c.name: c for c in machine.components}
     while part.axis is None and part.parent is not None:
         part = named[part.parent]

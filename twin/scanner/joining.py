@@ -35,35 +35,35 @@ from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.scanner.safety import Contact, Guard, floor, would_touch
 from flexdt.twin.scanner.state import NamedCorrection, Sample
 
-LEAST_STEP = 0.05
-"""A motion that cannot get farther than this before a contact does not begin [mm, deg]."""
-FIRST_S = 0.5
-"""How long before a contact braking is tried first [s]."""
+MIN_STEP = 0.05
+"""Shortest motion that begins before a contact [mm, deg]."""
+FIRST_LEAD_S = 0.5
+"""Lead of the first attempt at braking before a contact [s]."""
 HALVINGS = 7
 """Bisection steps for the moment at which motors must brake before a contact."""
 SWEPT_HALVINGS = 4
 """The same where each step is a sweep."""
-QUICKER = (0.0, 0.125, 0.25, 0.5)
+QUICKER_STOP_SHARES = (0.0, 0.125, 0.25, 0.5)
 """Shares of a stop along the path after which stopping each motor by itself is tried."""
-WORTH_S = 0.02
-"""A stop that is quicker by less than this is not looked for [s]."""
+MIN_GAIN_S = 0.02
+"""Least gain of time for which a quicker stop is used [s]."""
 
 Trajectories = Mapping[str, Trajectory]
 StopPath = Literal["along", "apart", "coasting"]
 """How motors come to rest, see `StopMotion`."""
-MANY_LEGS = 500
-"""A programme of more trajectories than these is too long to be swept at a takeover."""
+MAX_SWEPT_LEGS = 500
+"""Largest number of trajectories of a programme that is swept at a takeover."""
 
 
 @dataclass(frozen=True)
 class Joined:
-    """A certified programme that does what was asked, or as much of it as is free.
+    """A certified programme that does what was requested, or the free part of it.
 
-    Of a change of the stage: what is under way, or the halt of it.
+    For a change of the stage it is the programme under way, or its halt.
 
     Attributes:
         trajectories: of the motors whose programme changes; none if nothing does.
-        contact: what cut it short; None where all of it is free.
+        contact: that cut it short; None where all of it is free.
     """
 
     trajectories: Trajectories
@@ -72,11 +72,12 @@ class Joined:
 
 @dataclass(frozen=True)
 class JogMotion:
-    """What a jog comes to.
+    """The motion that a jog results in.
 
     Attributes:
         duration_s: until the motors rest.
-        cut_short: the contact that it ends before; None where it runs for all of its lease.
+        cut_short: the contact that it ends before; None where it runs for all of its
+            lease.
         rests: motor -> where it comes to rest [mm, deg].
     """
 
@@ -86,7 +87,7 @@ class JogMotion:
 
     @property
     def warnings(self) -> list[str]:
-        """A jog that was cut short, in words."""
+        """Message about a jog that was cut short, if it was."""
         if self.cut_short is None:
             return []
         where = ", ".join(f"{name}={value:g}" for name, value in self.rests.items())
@@ -121,7 +122,7 @@ class StopMotion:
         now: float,
         would_hit: Contact | None = None,
     ) -> StopMotion:
-        """From trajectories that begin at `now` or earlier."""
+        """Make the value from trajectories that begin at `now` or earlier."""
         distances = {
             n: abs(t.target - t.position(now)) for n, t in trajectories.items() if t.moving(now)
         }
@@ -134,9 +135,10 @@ class Lookahead:
     """All motors from `now` on.
 
     Attributes:
-        machine: which motors are coupled, and the most they can brake with.
+        machine: which motors are coupled, and the greatest acceleration they can brake
+            with.
         guard: finds the first contact; None finds none.
-        drives: every motor with all that it is to follow.
+        drives: every motor with its whole programme.
         now: the moment [s].
     """
 
@@ -147,15 +149,16 @@ class Lookahead:
 
     @property
     def hardest(self) -> dict[str, float]:
-        """Motor -> the most that it can brake with [mm/s2, deg/s2]."""
+        """Motor -> greatest acceleration that it can brake with [mm/s2, deg/s2]."""
         return {name: axis.max_acceleration for name, axis in self.machine.axes.items()}
 
     def ahead(self) -> dict[str, Trajectory]:
-        """What is programmed for the motors that have not come to their last rest."""
+        """Return the programmes of the motors that have not come to their last rest."""
         return {n: d.ahead(self.now) for n, d in self.drives.items() if d.end > self.now}
 
     def contact(self, trajectories: Trajectories, since: float | None = None) -> Contact | None:
-        """The first contact if some motors follow `trajectories` and the others their programme.
+        """Find the first contact if some motors follow `trajectories`, the others their
+        programme.
 
         Args:
             trajectories: motor -> trajectory.
@@ -170,7 +173,7 @@ class Lookahead:
     def touching(
         self, *, deep: bool = False, standing: bool = False
     ) -> Mapping[tuple[str, str], float]:
-        """Pairs within the safety margin now, as `Guard.touching`, wherever they are going.
+        """Find the pairs within the safety margin now, as `Guard.touching`.
 
         Args:
             deep: measure overlaps.
@@ -185,7 +188,7 @@ class Lookahead:
     # Joining ------------------------------------------------------------------------------------
 
     def joined(self, new: Trajectories) -> Joined:
-        """The first certified programme of these, or none.
+        """Find the first certified programme of these three, or none.
 
         1. The new motors do what is asked, the others carry on.
         2. The new motors halt before the contact, the others carry on.
@@ -208,13 +211,14 @@ class Lookahead:
         return Joined(halted, contact)
 
     def _goes(self, name: str, way: Trajectory) -> bool:
-        """Whether a motor has anything to do: it is under way, or gets somewhere."""
+        """Return whether a motor is under way, or gets farther than `MIN_STEP`."""
         here = self.drives[name].at(self.now)
-        far = abs(way.target - here.position(self.now)) >= LEAST_STEP
+        far = abs(way.target - here.position(self.now)) >= MIN_STEP
         return far or here.velocity(self.now) != 0.0
 
     def _alone(self, new: Trajectories, contact: Contact) -> dict[str, Trajectory] | None:
-        """One motor that moves alone: its last free position is known, and its way there."""
+        """Shorten the motion of a single motor to its last free position; None if that is
+        not free."""
         if len(new) != 1:
             return None
         ((name, planned),) = new.items()
@@ -226,10 +230,11 @@ class Lookahead:
         return halted if self.contact(halted) is None else None
 
     def _halt_along(self, new: Trajectories, contact: Contact) -> dict[str, Trajectory] | None:
-        """`new`, slowed along its path as late as it can be; the path is free up to the contact."""
+        """Slow `new` along its path as late as possible; the path is free up to the contact."""
         moving = {name: self.drives[name].following(t) for name, t in new.items()}
 
         def rests_in_time(at: float) -> bool:
+            """Return whether a stop begun at `at` ends before the contact."""
             return programme_time_at_rest(moving, at, self.hardest) <= contact.last_free_time
 
         at = self._latest(rests_in_time, contact, HALVINGS)
@@ -240,14 +245,16 @@ class Lookahead:
         )
 
     def _new_halt_swept(self, new: Trajectories, contact: Contact) -> dict[str, Trajectory] | None:
-        """`new`, slowed among itself as late as it can be while the others carry on."""
+        """Slow `new` by itself as late as possible while the others carry on."""
 
         alone = {name: self.drives[name] for name in new}
 
         def halted(at: float) -> dict[str, Trajectory]:
+            """Brake the new motors from `at` on."""
             return _trajectories(braked_at(alone, at, new, self.hardest), new)
 
         def free(at: float) -> bool:
+            """Return whether that is free of contacts."""
             return self.contact(halted(at), since=at) is None
 
         at = self._latest(free, contact, SWEPT_HALVINGS)
@@ -256,11 +263,13 @@ class Lookahead:
     def _latest(
         self, holds: Callable[[float], bool], contact: Contact, halvings: int
     ) -> float | None:
-        """A late moment before the contact for which `holds`; None where none is found.
+        """Find a late moment before the contact for which `holds`; None if none is found.
+
+        Steps back from the contact double until it holds, then bisection.
 
         First ever farther back from the contact, then bisection.
         """
-        late, back = contact.last_free_time, FIRST_S
+        late, back = contact.last_free_time, FIRST_LEAD_S
         while True:
             early = max(self.now, contact.last_free_time - back)
             if holds(early):
@@ -279,7 +288,7 @@ class Lookahead:
     # Stopping -----------------------------------------------------------------------------------
 
     def stopped(self, most: Most = None) -> StopMotion:
-        """Everything brought to rest: along the path, or quicker where a sweep shows that free.
+        """Stop everything: along the path, or quicker where a sweep shows that free.
 
         Args:
             most: motor -> greatest acceleration; None: what the motion was planned with.
@@ -294,18 +303,19 @@ class Lookahead:
         return StopMotion.of(along, "along", self.now)
 
     def _quicker(self, along: Trajectories, most: Most) -> dict[str, Trajectory] | None:
-        """Along the path for a while and then each motor by itself, if a sweep shows it free."""
+        """Find a quicker stop: along the path for a while, then each motor by itself, if
+        free."""
         whole = max((t.end for t in along.values()), default=self.now) - self.now
         due = [n for n, d in self.drives.items() if d.end > self.now]
         strongest = {
             name: greatest(name, d.at(self.now), self.now, most) for name, d in self.drives.items()
         }
         slowed = {name: self.drives[name].following(t) for name, t in along.items()}
-        for share in QUICKER:
+        for share in QUICKER_STOP_SHARES:
             at = self.now + share * whole
             drives = slowed if share else self.drives
             apart = braked_apart(self.machine, drives, at, strongest)
-            if max((t.end for t in apart.values()), default=at) > self.now + whole - WORTH_S:
+            if max((t.end for t in apart.values()), default=at) > self.now + whole - MIN_GAIN_S:
                 return None
             trajectories = {n: motion.rejoined(along[n], at, rest) for n, rest in apart.items()}
             # The one motor that has anything to do brakes on the path that it was swept on. Where
@@ -319,25 +329,26 @@ class Lookahead:
     # Changes of the stage -----------------------------------------------------------------------
 
     def on(self, guard: Guard | None) -> Lookahead:
-        """The same motors, with another stage."""
+        """Return the same motors with another stage's guard."""
         return Lookahead(self.machine, guard, self.drives, self.now)
 
     @property
     def legs(self) -> int:
-        """Trajectories of the motors that are under way; a long programme has thousands."""
+        """Number of trajectories of the motors under way; a long programme has thousands."""
         return sum(len(d.trajectories) for d in self.drives.values() if d.end > self.now)
 
     def halted_at_once(self, contact: Contact) -> Trajectories | None:
-        """What is under way, slowed along its path from now on, if it rests before a contact."""
+        """Slow what is under way along its path from now on, if it rests before a contact."""
         if programme_time_at_rest(self.drives, self.now, self.hardest) > contact.last_free_time:
             return None
         return braked_along(self.drives, self.now, self.hardest)
 
     def halted(self, under_way: Trajectories, contact: Contact) -> Trajectories | None:
-        """What is under way, brought to rest before a contact that has come to lie ahead of it.
+        """Halt what is under way before a contact that a new stage has put ahead of it.
 
-        As late as can be along the path, which is free up to the contact; where the contact is
-        too near for that, at once and as hard as the machine can, if a sweep shows that free.
+        As late as can be along the path, which is free up to the contact; where the
+        contact is too near for that, at once and as hard as the machine can, if a sweep
+        shows that free.
         """
         halted = self._alone(under_way, contact) or self._halt_along(under_way, contact)
         if halted is not None:
@@ -351,7 +362,7 @@ class Lookahead:
         return None
 
     def _within_travel(self, trajectories: Trajectories) -> bool:
-        """Whether motors that brake by themselves rest within their travel.
+        """Return whether motors that brake by themselves rest within their travel.
 
         One that stops in step with a weaker one goes farther than its own programme did.
         """
@@ -363,12 +374,13 @@ class Lookahead:
 
 
 def _trajectories(drives: Mapping[str, Drive], names: Trajectories) -> dict[str, Trajectory]:
+    """Return the first trajectory of each named motor."""
     return {name: drives[name].trajectories[0] for name in names}
 
 
 @dataclass(frozen=True)
 class UnsweptProgramme:
-    """A programme that has to be swept before it may be followed, and all that the sweep needs.
+    """A programme that must be swept before it may be followed, and the sweep's inputs.
 
     Frozen, so that the sweep may run in another thread while the scanner lives on.
 
@@ -385,7 +397,7 @@ class UnsweptProgramme:
     guard: Guard | None = field(repr=False)
 
     def certified(self) -> CertifiedProgramme:
-        """Sweep all of it; takes about 60 ms for 1440 steps."""
+        """Sweep the whole programme; takes about 60 ms for 1440 steps."""
         standing = {name: motion.at_rest(x, 0.0) for name, x in self.start.items()}
         legs = {name: motion.joined(legs) for name, legs in self.legs.items()}
         contact = None if self.guard is None else self.guard({**standing, **legs}, 0.0)
@@ -393,7 +405,7 @@ class UnsweptProgramme:
 
     @property
     def legs(self) -> dict[str, tuple[Trajectory, ...]]:
-        """Motor -> what it follows, the wait for a first leg that begins later included."""
+        """Motor -> trajectories, the wait for a first one that begins later included."""
         out = {}
         for name, legs in self.programme.items():
             wait = [motion.at_rest(self.start[name], 0.0)] if legs and legs[0].start > 0.0 else []
@@ -403,7 +415,7 @@ class UnsweptProgramme:
 
 @dataclass(frozen=True)
 class CertifiedProgramme:
-    """What the sweep of a programme found; it holds for the version it was prepared for."""
+    """Result of the sweep of a programme; valid for the version it was prepared for."""
 
     prepared: UnsweptProgramme
     contact: Contact | None
@@ -411,7 +423,8 @@ class CertifiedProgramme:
 
 @dataclass(frozen=True)
 class StageChange:
-    """A change with all that its sweep needs; frozen, so that the sweep may run in a thread.
+    """A change of the stage with its sweep's inputs; frozen, so that the sweep may run in
+    a thread.
 
     Attributes:
         sample: what is to stand on the stage.
@@ -432,18 +445,20 @@ class StageChange:
     targets: Mapping[str, float]
     paces: Mapping[str, tuple[float, float]]
     found: Joined | None = None
-    """What `certified` has found."""
+    """Result of `certified`."""
 
     def certified(self) -> StageChange:
-        """The same change, once it is known that it may be put in force.
+        """Judge the change; return it with the verdict.
 
         Raises:
-            CollisionError: what is under way is not free of the new stage, and no stop of it is.
+            CollisionError: what is under way is not free of the new stage, and no stop of
+                it is.
         """
         return replace(self, found=self.verdict())
 
     def renewed(self, before: StageChange) -> Joined:
-        """The verdict at the takeover, from the one that was found `before`; raises as `verdict`.
+        """Judge the change at the takeover, reusing the verdict found `before`; raises as
+        `verdict`.
 
         Raises:
             SafetyError: a long programme has begun meanwhile; nothing changes.
@@ -451,7 +466,7 @@ class StageChange:
         still, found = before.version == self.version and not self.moves, before.found
         if still and found is not None and found.contact is None:
             return Joined({})  # what was free to its end is so still
-        if self.ahead.legs <= MANY_LEGS:
+        if self.ahead.legs <= MAX_SWEPT_LEGS:
             return self.verdict()
         if still and found is not None and found.contact is not None:
             halted = self.ahead.halted_at_once(found.contact)
@@ -461,7 +476,8 @@ class StageChange:
         raise SafetyError(what, {"allowed": "asking again"})
 
     def verdict(self) -> Joined:
-        """Whether what is under way may carry on, or how it is halted; raises as `certified`."""
+        """Judge whether what is under way may carry on, or how it is halted; raises as
+        `certified`."""
         changed, now = self.ahead.on(self.guard), self.ahead.now
         under_way = self.ahead.ahead()
         self._require_no_nearer(changed)
@@ -479,11 +495,14 @@ class StageChange:
         return Joined(halted, contact)
 
     def _require_no_nearer(self, changed: Lookahead) -> None:
-        """What is within the margin already may stay there, and keeps its floor.
+        """Check that pairs within the margin stay above their floor on the new stage.
 
-        A sample on a stage of the turntable counts wherever that can bring it. So what is near
-        already is measured where it stands as well: else the reach of one sample would excuse
-        another that really overlaps.
+        A sample on a stage of the turntable counts wherever that can bring it, so pairs
+        that are near already are measured where they stand as well: else the reach of one
+        sample would excuse another that really overlaps.
+
+        Raises:
+            CollisionError: a pair is nearer than its floor.
         """
         margin = self.ahead.machine.safety_margin_mm
         for standing in (False, True):
@@ -498,6 +517,7 @@ class StageChange:
     def _refused(
         self, pair: tuple[str, str], seconds: float, last_free: Mapping[str, float]
     ) -> CollisionError:
+        """Make the error for a change that brings parts together."""
         what = f"sample {self.sample.name!r}" if self.sample.name else "the empty stage"
         if self.correction is not None:
             what += f" with correction {self.correction.name!r}"

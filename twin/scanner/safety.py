@@ -21,28 +21,32 @@ from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.scanner.state import Safety
 
 RUNG_MM = 5e-3
-"""Spacing of the floors [mm]: what all histories together may take from a gap within the margin.
-Half the tolerance of a sweep, and large beside `ROUNDING_MM`."""
+"""Spacing of the floors [mm]: the most that all histories together take from a gap.
+
+Half the tolerance of a sweep, and large beside `ROUNDING_MM`.
+"""
 ROUNDING_MM = 1e-4
-"""What rounding may take from a gap, and a braked path that strays from the one that was swept."""
+"""Amount by which rounding, and a braked path beside the swept one, may reduce a gap [mm]."""
 
 
 def floor(gap: float, margin: float) -> float:
-    """The gap that two parts keep from now on, whatever they are asked to do, until they are apart.
+    """Compute the gap that two parts keep from now on, whatever the commands, until they
+    separate.
 
-    Floors are rungs of a ladder, `RUNG_MM` apart. Its top rung is one above the safety margin, and
-    what is free keeps to that. A pair that is nearer (after a restart with another machine file, or
-    after coasting) keeps to the rung below its gap. The rungs do not move, and a gap that was kept
-    above a rung has a floor no lower than that rung: so a thousand motions, new samples,
-    corrections and restarts take no more from a gap than one, and nothing has to be remembered
-    between them.
+    Floors are rungs of a ladder, `RUNG_MM` apart. Its top rung is one above the safety
+    margin, and what is free keeps to that. A pair that is nearer (after a restart with
+    another machine file, or after coasting) keeps to the rung below its gap. The rungs do
+    not move, and a gap that was kept above a rung has a floor no lower than that rung: so
+    a thousand motions, new samples, corrections and restarts take no more from a gap than
+    one, and nothing has to be remembered between them.
 
     Args:
         gap: between the two now, negative for the depth of an overlap [mm].
         margin: the machine's safety margin [mm].
 
     Returns:
-        The least gap allowed [mm]; no more than `gap`, so that what has sunk below its rung by
+        The least gap allowed [mm]; no more than `gap`, so that what has sunk below its
+        rung by
         rounding may go anywhere but nearer.
     """
     rung = 1.0
@@ -53,14 +57,14 @@ def floor(gap: float, margin: float) -> float:
 
 @dataclass(frozen=True)
 class Contact:
-    """Where a motion comes to the safety margin.
+    """A motion reaching the safety margin.
 
     Attributes:
         pair: names of the two components.
         time: when [s].
         positions: of every motor then [mm, deg].
-        last_free: positions at the last moment known to be free, a little before; where the
-            motion starts in contact, the start.
+        last_free: positions at the last moment known to be free, a little before; where
+            the motion starts in contact, the start.
         last_free_time: that moment [s].
         clearance_mm: certified clearance at `time`.
         free_before: whether there was a free moment before at all.
@@ -76,25 +80,26 @@ class Contact:
 
 
 class Guard(Protocol):
-    """Finds contacts with what stands on one stage, and changes nothing."""
+    """Finds contacts on one stage; it changes nothing."""
 
     def __call__(self, trajectories: Mapping[str, Trajectory], now: float, /) -> Contact | None:
-        """The first contact from now on, given the trajectory of every motor; None if none."""
+        """Find the first contact from `now` on, given the trajectory of every motor; None
+        if none."""
 
     def touching(
         self, positions: Mapping[str, float], *, deep: bool = False
     ) -> Mapping[tuple[str, str], float]:
-        """Pairs of a pose that are within the safety margin, with their clearances [mm].
+        """Find the pairs of a pose within the safety margin, with their clearances [mm].
 
         An overlap has 0, or (`deep`) how deep it is as a negative one.
         """
 
     def standing(self, positions: Mapping[str, float]) -> Guard:
-        """The guard of the same parts where they stand at a pose, without what they may sweep."""
+        """Return the guard of the same parts fixed at a pose, without what they may sweep."""
 
 
 def require_ready(safety: Safety, what: str) -> None:
-    """Raise unless motion is allowed.
+    """Check that motion is allowed.
 
     Raises:
         SafetyError: E-stop in force, or blocked; says how to get out.
@@ -107,7 +112,7 @@ def require_ready(safety: Safety, what: str) -> None:
 
 
 def after_contact(safety: Safety, contact: Contact) -> Safety:
-    """One more blocked attempt; at the maximum the state is blocked. An E-stop stays one."""
+    """Count a blocked attempt; at the maximum the state becomes blocked. An E-stop stays."""
     if safety.state == "estopped":
         return safety
     attempts = safety.blocked_attempts + 1
@@ -123,22 +128,25 @@ def after_contact(safety: Safety, contact: Contact) -> Safety:
 
 
 def after_free_motion(safety: Safety) -> Safety:
-    """A motion went through: the count of blocked attempts starts again."""
+    """Clear the count of blocked attempts after a motion that went through."""
     return replace(safety, blocked_attempts=0) if safety.blocked_attempts else safety
 
 
 def estopped(safety: Safety, by: str) -> Safety:
-    """The E-stop was pressed, perhaps once more: the next stop."""
+    """Record a press of the E-stop, perhaps a repeated one: the next stop."""
     reason = "the E-stop is in force"
     return replace(safety, state="estopped", reason=reason, stop=safety.stop + 1, stopped_by=by)
 
 
 def released(safety: Safety, stop: int | None) -> Safety:
-    """The state after a reset; a contact remains one, and is the next stop.
+    """Release an E-stop or a block; a contact remains one, and is the next stop.
 
     Args:
         safety: before it.
         stop: number of the stop that it is to release; None for whichever there is.
+
+    Returns:
+        The state after the reset.
 
     Raises:
         SafetyError: that is not the latest stop; nothing is released.
@@ -155,7 +163,7 @@ def released(safety: Safety, stop: int | None) -> Safety:
 
 
 def in_contact(safety: Safety, pair: tuple[str, str] | None) -> Safety:
-    """The state when `pair` is found in contact, or (None) when nothing is any more.
+    """Record that `pair` is in contact, or (None) that nothing is any more.
 
     Parts that have come apart leave the state blocked until a reset. An E-stop stays one.
     """
@@ -176,14 +184,15 @@ def in_contact(safety: Safety, pair: tuple[str, str] | None) -> Safety:
 def collision_error(
     contact: Contact, now: float, safety: Safety, what: str, halts_at: Mapping[str, float]
 ) -> CollisionError:
-    """The error for a motion that a contact cut short.
+    """Make the error for a motion that a contact cut short.
 
     Args:
         contact: what would have touched.
         now: time of the command [s].
         safety: the state after it.
         what: the command, for people.
-        halts_at: where motors come to rest instead [mm, deg]; empty where nothing changes.
+        halts_at: where motors come to rest instead [mm, deg]; empty where nothing
+            changes.
     """
     ahead = contact.time - now
     where = ", ".join(f"{axis} {value:.4g}" for axis, value in halts_at.items())
@@ -200,7 +209,17 @@ def would_touch(
     what: str, pair: tuple[str, str], ahead: float, last_free: Mapping[str, float], near: str,
     outcome: str, **data: object,
 ) -> CollisionError:  # fmt: skip
-    """The error for a command, `what`, after which two parts meet in `ahead` [s], or are `near`."""
+    """Make the error for a command after which two parts meet, or are too near.
+
+    Args:
+        what: the command, for people.
+        pair: the two parts.
+        ahead: time until they meet [s]; 0 for parts that are near now.
+        last_free: motor -> last free position [mm, deg].
+        near: words for parts that are near now.
+        outcome: words for what happens instead.
+        data: further members of the error's data.
+    """
     how = f"would collide in {ahead:.3g} s" if ahead > 0.0 else near
     told = {"asked": what, "pair": list(pair), "time_s": ahead, "last_free": dict(last_free)}
     return CollisionError(f"{what}: {' and '.join(pair)} {how}; {outcome}", {**told, **data})

@@ -36,7 +36,7 @@ from flexdt.twin.motion.drives import Drive
 from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.scanner import safety as rules
 from flexdt.twin.scanner.joining import (
-    LEAST_STEP,
+    MIN_STEP,
     CertifiedProgramme,
     JogMotion,
     Joined,
@@ -64,10 +64,10 @@ from flexdt.twin.scanner.state import (
 
 
 class ScannerTwin:
-    """A scanner: commands change it, readers ask it, both say when.
+    """A scanner: commands change it, queries read it, each at a stated time.
 
     Args:
-        machine: what it is.
+        machine: its description.
         profile: zero offsets in force.
         now: time at which it stands at home [s].
         guard: finds the first contact along planned motion; None sweeps nothing.
@@ -103,51 +103,51 @@ class ScannerTwin:
     # Reading ------------------------------------------------------------------------------------
 
     def trajectories(self, now: float) -> dict[str, Trajectory]:
-        """The trajectory in force of every motor."""
+        """Return the trajectory in force of every motor."""
         return {name: d.at(now) for name, d in self._drives.items()}
 
     def positions(self, now: float) -> dict[str, float]:
-        """Position of every motor [mm, deg], script's sign."""
+        """Return the position of every motor [mm, deg], script's sign."""
         return {name: d.at(now).position(now) for name, d in self._drives.items()}
 
     def velocities(self, now: float) -> dict[str, float]:
-        """Velocity of every motor [mm/s, deg/s]."""
+        """Return the velocity of every motor [mm/s, deg/s]."""
         return {name: d.at(now).velocity(now) for name, d in self._drives.items()}
 
     def targets(self, now: float) -> dict[str, float]:
-        """Where every motor will come to rest."""
+        """Return where every motor's present motion comes to rest [mm, deg]."""
         return {name: d.at(now).target for name, d in self._drives.items()}
 
     def final_positions(self) -> dict[str, float]:
-        """Where every motor stands when all that is under way has ended."""
+        """Return where every motor stands when its programme has ended [mm, deg]."""
         return {name: d.final for name, d in self._drives.items()}
 
     def moving(self, now: float) -> bool:
-        """Whether any motor is under way."""
+        """Return whether any motor is under way."""
         return any(d.at(now).moving(now) for d in self._drives.values())
 
     def rest_time(self, now: float) -> float:
-        """When the last motor comes to rest, at least `now` [s]."""
+        """Return when the last motor comes to rest, at least `now` [s]."""
         return max(now, *(d.end for d in self._drives.values()))
 
     @property
     def programmes(self) -> int:
-        """How many programmes have been taken over: another number is another programme."""
+        """Number of programmes that have been taken over; it identifies the present one."""
         return self._programmes
 
     @property
     def stops(self) -> int:
-        """How often motion was stopped: what was allowed before a stop need not be after it."""
+        """Number of times motion was stopped; a permission from before a stop is void."""
         return self._stops
 
     def settings(self, axis: str) -> tuple[float, float]:
-        """Speed and acceleration that the next motion of motor `axis` will have."""
+        """Return speed and acceleration of the next motion of motor `axis`."""
         self.machine.axis(axis)
         return self._drives[axis].speed, self._drives[axis].acceleration
 
     @property
     def paces(self) -> dict[str, tuple[float, float]]:
-        """Motor -> speed and acceleration that its next motion will have."""
+        """Motor -> speed and acceleration of its next motion."""
         return {axis: self.settings(axis) for axis in self.machine.axes}
 
     @property
@@ -161,17 +161,18 @@ class ScannerTwin:
         return self.camera.pixel_mm(self.machine.detector.pixels)
 
     def poses(self, now: float) -> Poses:
-        """Nominal poses, n = 1."""
+        """Compute the nominal poses, n = 1."""
         return self.poses_at(self.positions(now), self.camera)
 
     def poses_at(self, positions: Mapping[str, npt.ArrayLike], camera: CameraSettings) -> Poses:
-        """Nominal poses for positions [mm, deg], scalars or (n,), and any camera settings."""
+        """Compute nominal poses for positions [mm, deg], scalars or (n,), and any camera
+        settings."""
         return motor_poses(self.machine, self.profile, camera, positions)
 
     def corrected(
         self, nominal: Poses, camera: CameraSettings, correction: NamedCorrection | None
     ) -> ConeVec:
-        """Geometry of poses with `correction`, checked (thesis 4.8.3).
+        """Compute the geometry of poses with `correction`, checked (thesis 4.8.3).
 
         Raises:
             GeometryError: a geometry no scanner can have.
@@ -181,7 +182,8 @@ class ScannerTwin:
         return check_cone_vec(nominal.cone_vec(parameters), pixel)
 
     def cone_vec(self, now: float) -> ConeVec:
-        """Nominal geometry plus the correction in force, checked (thesis 4.8.3), n = 1.
+        """Compute the nominal geometry plus the correction in force, checked (thesis
+        4.8.3), n = 1.
 
         Raises:
             GeometryError: a geometry no scanner can have.
@@ -189,7 +191,7 @@ class ScannerTwin:
         return self.corrected(self.poses(now), self.camera, self.correction)
 
     def state(self, now: float) -> ScannerState:
-        """Everything public, as one frozen value."""
+        """Return everything public, as one frozen value."""
         axes = {name: self._axis_state(name, now) for name in self.machine.axes}
         for name, virtual in self.machine.virtual_axes.items():
             axes[name] = self._virtual_state(name, axes[virtual.of], now)
@@ -206,8 +208,10 @@ class ScannerTwin:
         )
 
     def _readout(self, now: float) -> Readout | None:
-        """Derived geometry. It takes most of a state's time, so a scanner at rest keeps it: an
-        E-stop is answered, and its watchers told, in half the time."""
+        """Compute derived geometry, or return the last one if nothing has changed.
+
+        It takes most of a state's time, and keeping it halves the answer to an E-stop.
+        """
         positions = self.positions(now)
         made_of = (tuple(positions.values()), self.camera, self.parameters)
         if self._derived[0] != made_of:
@@ -263,7 +267,17 @@ class ScannerTwin:
         relative: bool = False,
         shortest: bool = False,
     ) -> dict[str, float]:
-        """Motor targets that a move would have; raises as `move`, and nothing moves."""
+        """Compute the motor targets that a move would have; nothing moves.
+
+        Args:
+            targets, now, relative, shortest: as for `move`.
+
+        Returns:
+            Motor -> target [mm, deg].
+
+        Raises:
+            UnknownNameError, LimitError: as `move`.
+        """
         planned = plan.plan_move(
             self.machine, self._drives, targets, now, relative=relative, shortest=shortest
         )
@@ -272,7 +286,7 @@ class ScannerTwin:
     def told_of(
         self, targets: Mapping[str, float], now: float, *, relative: bool = False
     ) -> list[str]:
-        """What of a move's targets lies beyond a limit and would arrive at it, in words.
+        """List messages about targets beyond a limit that would arrive at it.
 
         Raises:
             UnknownNameError: no such axis.
@@ -289,10 +303,11 @@ class ScannerTwin:
         return [f"{said}; set to the limit" for each in found for said in each.told]
 
     def jog(self, axis: str, velocity: float, lease_s: float, now: float) -> JogMotion:
-        """Run `axis` at `velocity` until the lease ends or a limit nears, and brake.
+        """Run `axis` at `velocity` until the lease ends or a limit nears, then brake.
 
-        A jog that a contact cuts short runs as far as it is free, and says so. One that cannot go
-        at all is a blocked attempt and changes nothing: the lease that it was to renew runs out.
+        A jog that a contact cuts short runs as far as it is free, and says so. One that
+        cannot go at all is a blocked attempt and changes nothing: the lease that it was
+        to renew runs out.
 
         Raises:
             UnknownNameError, LimitError, SafetyError, CollisionError: as `move`.
@@ -303,7 +318,7 @@ class ScannerTwin:
         if joined.contact is not None and not joined.trajectories:
             raise self._blocked(joined, now, f"jog {axis} at {velocity:g}")
         goes = any(
-            abs(t.target - t.position(now)) >= LEAST_STEP for t in joined.trajectories.values()
+            abs(t.target - t.position(now)) >= MIN_STEP for t in joined.trajectories.values()
         )
         if joined.contact is None and goes:
             self.safety = rules.after_free_motion(self.safety)
@@ -313,13 +328,13 @@ class ScannerTwin:
         return JogMotion(max(0.0, seconds), joined.contact, rests)
 
     def stop(self, now: float) -> StopMotion:
-        """Bring every motor to rest on what was swept; works in every state, ends a programme."""
+        """Stop every motor on a swept path; works in every state, and ends a programme."""
         if now < self._coasts_until:  # without power nothing brakes
             return StopMotion.of(self.trajectories(now), "coasting", now)
         return self._stopped(self._lookahead(now).stopped())
 
     def estop(self, now: float, by: str = "") -> StopMotion:
-        """Bring the motors to rest as the machine's stop category says; X-rays off.
+        """Stop the motors as the machine's stop category says; switch X-rays off.
 
         Motion and X-rays are rejected until a reset.
 
@@ -340,24 +355,26 @@ class ScannerTwin:
         return self._stopped(ahead.stopped(ahead.hardest))
 
     def reset(self, now: float, stop: int | None = None) -> None:
-        """Leave E-stop or blocked; nothing starts by itself, and a contact remains one.
+        """Leave E-stop or blocked; no motion starts, and a contact remains one.
 
         Args:
             now: time of the command [s].
-            stop: `Safety.stop` as whoever asks has seen it; None releases whichever stop it is.
+            stop: `Safety.stop` as whoever asks has seen it; None releases whichever stop
+                it is.
 
         Raises:
-            SafetyError: motors coast still (a reset is judged by where they come to rest), or
-                there has been another stop since `stop`; nothing is released.
+            SafetyError: motors coast still (a reset is judged by where they come to
+                rest), or there has been another stop since `stop`; nothing is released.
         """
         self._require_power("a reset", now)
         self.safety = rules.released(self._safety_at(now), stop)
 
     def place(self, positions: Mapping[str, float], now: float) -> None:
-        """Put motors where they are known to stand, at rest: a start, not a motion.
+        """Set motors to their known positions, at rest: a start, not a motion.
 
         Raises:
-            UnknownNameError, LimitError: no such motor, or outside its travel; nothing is changed.
+            UnknownNameError, LimitError: no such motor, or outside its travel; nothing is
+                changed.
         """
         wanted = resolve_targets(self.machine, positions, self.positions(now))
         stand = {**self.targets(now), **wanted}
@@ -372,14 +389,15 @@ class ScannerTwin:
         now: float,
         start: Mapping[str, float] | None = None,
     ) -> UnsweptProgramme:
-        """A programme with all that its sweep needs; `certified` on it may run in another thread.
+        """Prepare a programme for its sweep; `certified` on the result may run in another
+        thread.
 
         Args:
-            programme: motor -> trajectories in the order of their starts, on a clock that shows 0
-                when it is taken over.
+            programme: motor -> trajectories in the order of their starts, on a clock that
+                shows 0 when it is taken over.
             now: time of the command [s].
-            start: where motors will stand then, at rest; those left out where they are bound for
-                [mm, deg].
+            start: where motors will stand then, at rest; those left out where their
+                programme ends [mm, deg].
 
         Raises:
             UnknownNameError: no such motor.
@@ -392,21 +410,23 @@ class ScannerTwin:
         return UnsweptProgramme(programme, stand, (self._stage, self._stops), self.guard)
 
     def may_follow(self, certificate: CertifiedProgramme, now: float) -> bool:
-        """Whether all is as it was prepared for: the stage, no stop since, the motors at rest."""
+        """Return whether stage, stops and motors are as the programme was prepared for."""
         here = not self.moving(now) and self.positions(now) == certificate.prepared.start
         return here and self.holds(certificate)
 
     def holds(self, certificate: CertifiedProgramme) -> bool:
-        """Whether stage and stops are those that a programme was prepared for."""
+        """Return whether stage and stops are those that a programme was prepared for."""
         return certificate.prepared.version == (self._stage, self._stops)
 
     def follow(self, certificate: CertifiedProgramme, now: float) -> None:
         """Take over a programme that was swept.
 
         Raises:
-            CollisionError: a contact anywhere along it; nothing moves, the attempt counts.
-            SafetyError: E-stopped or blocked; the motors are not at rest at its start, or stage
-                or motion have been changed since it was prepared (prepare it again).
+            CollisionError: a contact anywhere along it; nothing moves, the attempt
+                counts.
+            SafetyError: E-stopped or blocked; the motors are not at rest at its start, or
+                stage or motion have been changed since it was prepared (prepare it
+                again).
         """
         self._require_ready("a programme", now)
         prepared = certificate.prepared
@@ -431,7 +451,7 @@ class ScannerTwin:
         targets: Mapping[str, float] | None = None,
         paces: Mapping[str, tuple[float, float]] | None = None,
     ) -> StageChange:
-        """Another sample or correction, with all that its sweep needs; nothing is changed yet.
+        """Prepare another sample or correction for its sweep; nothing is changed yet.
 
         `certified` on it may run in another thread; then `take_stage` puts it in force.
 
@@ -464,17 +484,22 @@ class ScannerTwin:
         )
 
     def take_stage(self, change: StageChange, now: float) -> CollisionError | None:
-        """Put a certified change of the stage in force.
+        """Put a certified change of the stage in force: sample, correction, guard, paces
+        and moves.
 
-        What is under way is judged anew where it has changed meanwhile. Motion that is not free of
-        the new stage is halted, if halting is.
+        What is under way is judged anew where it has changed meanwhile. Motion that is
+        not free of the new stage is halted, if halting is free. Moves of the change
+        begin.
 
         Returns:
-            What halted the motion under way, if anything did; it counts as a blocked attempt.
+            The contact that halted the motion under way, as an error, or None; it counts
+            as a blocked
+            attempt.
 
         Raises:
             CollisionError: not even halting is free of the new stage; nothing changes.
-            SafetyError: the stage was changed meanwhile, or a long programme has begun.
+            SafetyError: the stage was changed meanwhile, motion was stopped, or a long
+                programme has begun.
         """
         if change.version[0] != self._stage:
             raise SafetyError(
@@ -508,10 +533,16 @@ class ScannerTwin:
     def initialise_stage(
         self, sample: Sample, correction: NamedCorrection | None, guard: Guard | None, now: float
     ) -> list[str]:
-        """Begin with this stage, whatever it touches: at a start the past cannot be helped.
+        """Begin with this stage, whatever it touches, as after a restart.
+
+        Args:
+            sample: on the stage.
+            correction: in force; None for none.
+            guard: finds contacts with both of them.
+            now: time [s].
 
         Returns:
-            What touches, in words; the state is blocked then.
+            Messages about what touches; the state is blocked then.
 
         Raises:
             GeometryError: a correction that no scanner can have.
@@ -535,7 +566,7 @@ class ScannerTwin:
     def set_axis(
         self, axis: str, *, speed: float | None = None, acceleration: float | None = None
     ) -> None:
-        """Speed and acceleration of the motors of `axis`, from their next motion on.
+        """Set speed and acceleration of the motors of `axis`, from their next motion on.
 
         Raises:
             UnknownNameError, LimitError.
@@ -584,12 +615,13 @@ class ScannerTwin:
     # Inside -------------------------------------------------------------------------------------
 
     def _take(self, trajectories: Mapping[str, Trajectory]) -> None:
-        """Replace the programmes of motors: the caller holds a certificate for it."""
+        """Replace the programmes of motors; the caller holds a certificate for it."""
         self._programmes += 1
         for name, trajectory in trajectories.items():
             self._drives[name] = self._drives[name].following(trajectory)
 
     def _stopped(self, stopping: StopMotion) -> StopMotion:
+        """Follow a stop and count it."""
         self._stops += 1
         self._take(stopping.trajectories)
         return stopping
@@ -597,13 +629,16 @@ class ScannerTwin:
     def _set_stage(
         self, sample: Sample, correction: NamedCorrection | None, guard: Guard | None
     ) -> None:
+        """Set sample, correction and guard, and count the change."""
         self.sample, self.correction, self.guard = sample, correction, guard
         self._stage += 1
 
     def _lookahead(self, now: float) -> Lookahead:
+        """Return all motors and the guard at `now`."""
         return Lookahead(self.machine, self.guard, dict(self._drives), now)
 
     def _require_power(self, what: str, now: float) -> None:
+        """Raise SafetyError while motors coast."""
         if now < self._coasts_until:
             left = self._coasts_until - now
             raise SafetyError(
@@ -612,7 +647,7 @@ class ScannerTwin:
             )
 
     def _touching(self, now: float) -> tuple[str, str] | None:
-        """The nearest pair within the safety margin now; of a scanner at rest it is kept."""
+        """Find the nearest pair within the safety margin now; kept for a scanner at rest."""
         positions = self.positions(now)
         made_of = (tuple(positions.values()), self._stage)
         if self._judged[0] != made_of:
@@ -623,21 +658,25 @@ class ScannerTwin:
         return self._judged[1]
 
     def _safety_at(self, now: float) -> Safety:
-        """The safety state. Contact is judged by where the parts are, however they came there."""
+        """Return the safety state, with contact judged by where the parts are."""
         return in_contact(self.safety, self._touching(now))
 
     def _require_ready(self, what: str, now: float) -> None:
+        """Update the safety state, and raise SafetyError unless motion is allowed."""
         self.safety = self._safety_at(now)
         rules.require_ready(self.safety, what)
 
     def _blocked(self, joined: Joined, now: float, what: str, zero: float = 0.0) -> CollisionError:
-        """Halt before the contact, or stop everything when that was once too often; what to raise.
+        """Halt before the contact, or stop everything when attempts were blocked too often.
 
         Args:
             joined: the motion that is left, and the contact that cut it short.
             now: time of the command [s].
             what: the command, for people.
             zero: time at which the clock of the contact shows 0 [s].
+
+        Returns:
+            The error to raise.
         """
         contact = joined.contact
         assert contact is not None
@@ -651,6 +690,7 @@ class ScannerTwin:
         return collision_error(contact, now - zero, self.safety, what, stops)
 
     def _axis_state(self, name: str, now: float) -> AxisReading:
+        """Read a motor."""
         axis, drive = self.machine.axes[name], self._drives[name]
         t = drive.at(now)
         return AxisReading(
@@ -665,7 +705,7 @@ class ScannerTwin:
         )
 
     def _virtual_state(self, name: str, other: AxisReading, now: float) -> AxisReading:
-        """A virtual axis, read from the one motor it is defined by."""
+        """Read a virtual axis from the one motor it is defined by."""
         virtual = self.machine.virtual_axes[name]
         lower, upper = sorted(virtual.constant + virtual.factor * x for x in other.limits)
         return replace(

@@ -64,11 +64,11 @@ class TubeSettings:
     ready_at: float = -math.inf
 
     def ready(self, now: float) -> bool:
-        """Whether X-rays are on and stable."""
+        """Return whether X-rays are on and stable."""
         return self.on and now >= self.ready_at
 
     def ready_in_s(self, now: float) -> float | None:
-        """Seconds until they are; None while the tube is off."""
+        """Return the time until they are [s]; None while the tube is off."""
         return max(0.0, self.ready_at - now) if self.on else None
 
 
@@ -101,7 +101,8 @@ class StagePlacement:
         return turned
 
     def to_sample(self, cone_vec: ConeVec) -> ConeVec:
-        """A geometry of the object's frame in the sample's own frame (for the projector)."""
+        """Transform a geometry of the object's frame to the sample's own frame (for the
+        projector)."""
         if self == StagePlacement():
             return cone_vec
         back = self.rotation.T
@@ -140,7 +141,7 @@ class NamedCorrection:
     def from_edge(
         cls, name: str, date: str, values: Mapping[str, float], note: str
     ) -> NamedCorrection:
-        """The correction with these values [mm, deg].
+        """Make the correction with these values [mm, deg].
 
         Raises:
             UnknownNameError: a name that is not a parameter.
@@ -215,7 +216,7 @@ class ScannerState:
 def readout(
     poses: Poses, camera: CameraSettings, sensor: PixelGrid, parameters: Offsets = NOMINAL
 ) -> Readout | None:
-    """Derived quantities of the first of `poses`.
+    """Compute derived quantities of the first of `poses`.
 
     Args:
         poses: nominal poses, world frame.
@@ -224,7 +225,8 @@ def readout(
         parameters: the correction in force.
 
     Returns:
-        The readout, or None where there is none: the axis or the detector is not in front of
+        The readout, or None where there is none: the axis or the detector is not in front
+        of
         the focal spot.
     """
     cone = poses[:1].cone_vec(parameters)
@@ -236,7 +238,7 @@ def readout(
 def readout_of(
     cone: ConeVec, shape: tuple[int, int], pixels_mm: tuple[float, float], axis: FloatArray
 ) -> Readout | None:
-    """Derived quantities of the first view of a geometry, or None as `readout` has it.
+    """Compute derived quantities of the first view of a geometry, or None as for `readout`.
 
     Args:
         cone: in the object's frame.
@@ -280,14 +282,17 @@ class CameraChange(TypedDict, total=False):
 def switched(
     machine: Machine, tube: TubeSettings, on: bool, now: float | None, *, warm: bool
 ) -> TubeSettings:
-    """The tube's state after it is switched on or off.
+    """Switch the tube on or off.
 
     Args:
         machine: says how long the high voltage takes, and a warm-up after a long rest.
-        tube: before; switching on what is on changes nothing.
-        on: which.
+        tube: before; switching to its present state changes nothing.
+        on: on or off.
         now: time of the command [s]; None: the X-rays are ready already.
         warm: no warm-up, however long the rest was.
+
+    Returns:
+        The tube after it.
     """
     if now is None:
         return replace(tube, on=on, ready_at=-math.inf)
@@ -306,7 +311,7 @@ def switched(
 def changed_tube(
     spec: TubeSpec, tube: TubeSettings, kV: float | None, power_W: float | None
 ) -> TubeSettings:
-    """The tube with another voltage [kV] or power [W]; None stays.
+    """Change voltage [kV] or power [W] of a tube; None keeps it.
 
     Raises:
         LimitError: outside the tube's range; the message names the setting.
@@ -321,7 +326,7 @@ def changed_tube(
 def changed_camera(
     spec: DetectorSpec, camera: CameraSettings, change: CameraChange
 ) -> CameraSettings:
-    """The camera with other settings.
+    """Change settings of a camera; those left out stay.
 
     Raises:
         LimitError: outside what the detector allows; the message names the setting.
@@ -338,6 +343,7 @@ def changed_camera(
 
 
 def _require_within(device: str, name: str, value: float, lower: float, upper: float) -> None:
+    """Raise LimitError unless a setting is within its range."""
     if not lower <= value <= upper:
         what = f"{device} {name} {value:g} is outside [{lower:g}, {upper:g}]"
         raise LimitError(what, {"setting": name, "asked": value, "allowed": [lower, upper]})
@@ -366,7 +372,7 @@ def require_applicable(
 
 
 def _nearest(machine: Machine) -> dict[str, float]:
-    """Motor positions at which sample and detector are as near to the source as they get."""
+    """Compute the motor positions that bring sample and detector nearest to the source."""
     along = {
         name: machine.geometry.get("object_y", {}).get(name, 0.0)
         + machine.geometry.get("detector_y", {}).get(name, 0.0)
