@@ -261,7 +261,7 @@ def test_one_slab_is_held_at_a_time(
 def test_scatter_correction_reads_each_image_once(
     slabs: int, tmp_path: Path, reads: Counter[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("flexdt.twin.physics.scatter.MOST_HISTORIES", 16)
+    monkeypatch.setattr("flexdt.twin.physics.scatter.MAX_HISTORIES", 16)
     data = fx.open(written(tmp_path / "scan"))
     reads.clear()
     request = VolumeRequest(

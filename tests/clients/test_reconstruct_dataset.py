@@ -252,7 +252,7 @@ def test_scatter_is_subtracted_from_what_a_scanner_wrote(
     folders: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Less signal is more attenuation, everywhere in the plastic; texts alone are a scanner's."""
-    monkeypatch.setattr("flexdt.twin.physics.scatter.MOST_HISTORIES", 16)
+    monkeypatch.setattr("flexdt.twin.physics.scatter.MAX_HISTORIES", 16)
     words = ["reconstruct", str(folders["plain"]), *COARSE, "--out"]
     ways = {"raw": [], "less": ["--scatter-correction", "abs,steel"]}
     for name, more in ways.items():

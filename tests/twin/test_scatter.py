@@ -305,7 +305,7 @@ def test_standard_errors_hold_and_photons_and_energy_are_kept() -> None:
 
 @pytest.mark.slow
 def test_views_between_simulated_ones_are_interpolated(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scatter_kernels, "ORDERS_AT_MOST", 1)
+    monkeypatch.setattr(scatter_kernels, "MAX_ORDERS", 1)
     thing = box(WATER, 1.0, (20, 30, 20))
     beam, _ = mono(60.0)
     angle = np.radians(np.arange(0.0, 21.0, 1.0))
@@ -434,7 +434,7 @@ def test_subtracted_scatter_leaves_no_cupping(
 ) -> None:
     """Single scatter summed over the cylinder here, found and subtracted there from the images
     alone, where a photon interacts once."""
-    monkeypatch.setattr(scatter_kernels, "ORDERS_AT_MOST", 1)
+    monkeypatch.setattr(scatter_kernels, "MAX_ORDERS", 1)
     straight, scatter = cylinder_scan(atoms, density, radius)
     views = (len(TURN), 1, 1)
     clean = np.tile(-np.log(straight), views)

@@ -30,14 +30,17 @@ AVOGADRO_BARN = 0.602214076
 
 @dataclass(frozen=True, eq=False)
 class CrossSections:
-    """What scatter simulations need of m substances, each at its own density.
+    """Cross-sections of m substances, each at its own density, for scatter simulations.
 
     Attributes:
-        energy_keV: (e,) evenly spaced energies of `total`, `coherent` and `incoherent` [keV].
+        energy_keV: (e,) evenly spaced energies of `total`, `coherent` and `incoherent`
+            [keV].
         total: (m, e) linear attenuation coefficient [1/mm], of the attenuation tables.
         coherent, incoherent: (m, e) integrals of the differential cross-sections [1/mm].
-        root_step: step of the square root of x between the columns of the next three [1/A^(1/2)].
-        form: (m, q) F^2 summed over the atoms in a mm times the squared electron radius [1/mm].
+        root_step: step of the square root of x between the columns of the next three
+            [1/A^(1/2)].
+        form: (m, q) F^2 summed over the atoms in a mm times the squared electron radius
+            [1/mm].
         shell: (m, q) S, likewise.
         cumulated: (m, q) integral of `form` over x^2, from which angles are drawn.
     """
@@ -54,12 +57,13 @@ class CrossSections:
 
 @cache
 def _scattering() -> dict[str, FloatArray]:
+    """Load the shipped form factors and scattering functions."""
     return stored_arrays("scattering.npz")[0]
 
 
 @lru_cache(maxsize=16)
 def cross_sections(substances: tuple[Substance, ...]) -> CrossSections:
-    """Cross-sections of substances at their densities; their arrays cannot be written to.
+    """Compute the cross-sections of substances at their densities; the arrays are read-only.
 
     Args:
         substances: m materials, at least one.

@@ -23,24 +23,26 @@ from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.geometry.conventions import FloatArray
 
 _TOKEN = re.compile(r"([A-Z][a-z]?|\(|\))(\d+(?:\.\d+)?)?")
-HIGHEST_DENSITY = 25.0
-"""Denser than any element [g/cm3]."""
-STEEP = -2.7
+MAX_DENSITY_G_CM3 = 25.0
+"""Largest density that is accepted [g/cm3]; denser than any element."""
+ABSORPTION_EXPONENT = -2.7
 """Exponent of an element's attenuation over energy where absorption outweighs scattering."""
 
 
 @dataclass(frozen=True, eq=False)
 class Tables:
-    """All arrays are read-only.
+    """The shipped tables; all arrays are read-only.
 
     Attributes:
         energy_keV: (e,) centres of the bins [keV].
         kV: (k,) tube voltages of the spectra, growing.
-        fluence: (k, e) photons per cm2 and mAs in each bin, 1 m from a tungsten anode, no filter.
+        fluence: (k, e) photons per cm2 and mAs in each bin, 1 m from a tungsten anode, no
+            filter.
         elements: symbol -> row of `total`.
         molar_mass: (z,) [g/mol].
         total: (z, e) mass attenuation with coherent scattering [cm2/g].
-        edges_keV: (z, n) absorption edges above 5 keV, growing, NaN where there are fewer.
+        edges_keV: (z, n) absorption edges above 5 keV, growing, NaN where there are
+            fewer.
         provenance: where the numbers come from.
     """
 
@@ -56,7 +58,7 @@ class Tables:
 
 @lru_cache
 def tables() -> Tables:
-    """The shipped tables."""
+    """Load the shipped tables."""
     arrays, provenance = stored_arrays("tables.npz")
     symbols = [str(s) for s in arrays["symbols"]]
     return Tables(
@@ -72,8 +74,11 @@ def tables() -> Tables:
 
 
 def stored_arrays(file: str) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """The read-only arrays of a file of this package by name, numbers as float64, and their
-    provenance."""
+    """Load the arrays of a file of this package by name, numbers as float64, read-only.
+
+    Returns:
+        (name -> array, provenance).
+    """
     with (
         (resources.files("flexdt.twin.attenuation") / "data" / file).open("rb") as content,
         np.load(content, allow_pickle=False) as stored,
@@ -104,9 +109,9 @@ class Substance:
     density_g_cm3: float
 
     def __post_init__(self) -> None:
-        if not 0.0 < (density := self.density_g_cm3) <= HIGHEST_DENSITY:
+        if not 0.0 < (density := self.density_g_cm3) <= MAX_DENSITY_G_CM3:
             said = f"{self.name}: density {density:g} g/cm3"
-            raise LimitError.instead(said, density, f"above 0 and at most {HIGHEST_DENSITY:g}")
+            raise LimitError.instead(said, density, f"above 0 and at most {MAX_DENSITY_G_CM3:g}")
         for symbol, part in self.fractions:
             _row(symbol)
             if not part > 0.0:
@@ -118,13 +123,13 @@ class Substance:
 
     @property
     def parts(self) -> list[tuple[int, float]]:
-        """Its elements' rows of the tables and mass fractions, which add up to 1 exactly."""
+        """Rows of its elements in the tables and mass fractions, which add up to 1 exactly."""
         whole = sum(part for _, part in self.fractions)
         return [(_row(symbol), part / whole) for symbol, part in self.fractions]
 
     @classmethod
     def of(cls, name: str, formula: str, density_g_cm3: float) -> Substance:
-        """A chemical compound, e.g. Substance.of("water", "H2O", 1.0).
+        """Make a chemical compound, e.g. Substance.of("water", "H2O", 1.0).
 
         Raises:
             UnknownNameError: an element the table does not have.
@@ -134,7 +139,7 @@ class Substance:
 
     @classmethod
     def parse(cls, text: str) -> Substance:
-        """A substance written FORMULA@DENSITY [g/cm3], such as Al@2.70.
+        """Parse a substance written FORMULA@DENSITY [g/cm3], such as Al@2.70.
 
         Raises:
             UnknownNameError, LimitError: as `of`, or it is not written so.
@@ -149,10 +154,12 @@ class Substance:
 
     @classmethod
     def called(cls, text: str) -> Substance:
-        """A substance by the name of a sample's material, such as aluminium, or FORMULA@DENSITY.
+        """Look up a substance by the name of a sample's material, such as aluminium, or
+        parse FORMULA@DENSITY.
 
         Raises:
-            UnknownNameError: lists the materials there are; or an element without a table.
+            UnknownNameError: lists the materials there are; or an element without a
+                table.
             LimitError: as `parse`.
 
         Example:
@@ -165,33 +172,36 @@ class Substance:
         return found
 
     def mass_attenuation(self) -> FloatArray:
-        """mu/rho at the energies of the tables, (e,) [cm2/g]."""
+        """Compute mu/rho at the energies of the tables, (e,) [cm2/g]."""
         return np.asarray(sum(part * tables().total[row] for row, part in self.parts))
 
     def attenuation(self) -> FloatArray:
-        """Linear attenuation coefficient at the energies of the tables, (e,) [1/mm]."""
+        """Compute the linear attenuation coefficient at the energies of the tables, (e,)
+        [1/mm]."""
         return self.mass_attenuation() * (self.density_g_cm3 / 10.0)
 
     def attenuation_at(self, energy_keV: float) -> float:
-        """Linear attenuation coefficient at one energy [1/mm]: that of its own side of an edge."""
+        """Compute the linear attenuation coefficient at one energy [1/mm], on its side of
+        an edge."""
         mu = sum(part * _mass_at(row, energy_keV) for row, part in self.parts)
         return float(mu * self.density_g_cm3 / 10.0)
 
 
 def _mass_at(row: int, energy_keV: float) -> float:
-    """mu/rho of an element [cm2/g], log-log from the two nearest bins with no edge between."""
+    """Interpolate mu/rho of an element [cm2/g], log-log from the two nearest bins with no
+    edge between."""
     bins, edges, total = tables().energy_keV, tables().edges_keV[row], tables().total[row]
     alike = np.searchsorted(edges, bins, "right") == np.searchsorted(edges, energy_keV, "right")
     away = np.abs(bins - energy_keV)
     near, far = np.argsort(np.where(alike, away, np.inf) if alike.any() else away)[:2]
-    slope = STEEP  # where only one bin lies between two edges
+    slope = ABSORPTION_EXPONENT  # where only one bin lies between two edges
     if alike[near] and alike[far]:
         slope = math.log(total[far] / total[near]) / math.log(bins[far] / bins[near])
     return float(total[near] * (energy_keV / bins[near]) ** slope)
 
 
 def parse_formula(formula: str) -> dict[str, float]:
-    """Atoms of a formula: symbol -> number. Parentheses and decimal counts are allowed.
+    """Parse a formula to symbol -> number of atoms. Parentheses and decimal counts are allowed.
 
     Raises:
         LimitError: it cannot be read; says where.
@@ -221,13 +231,14 @@ def parse_formula(formula: str) -> dict[str, float]:
 
 
 def mass_fractions(atoms: Mapping[str, float]) -> dict[str, float]:
-    """Mass fractions of a compound from its numbers of atoms."""
+    """Compute the mass fractions of a compound from its numbers of atoms."""
     masses = {symbol: n * float(tables().molar_mass[_row(symbol)]) for symbol, n in atoms.items()}
     whole = sum(masses.values())
     return {symbol: mass / whole for symbol, mass in masses.items()}
 
 
 def _row(symbol: str) -> int:
+    """Return an element's row of the tables."""
     elements = tables().elements
     if symbol not in elements:
         what = f"no element {symbol!r} in the attenuation table; it has"
@@ -236,6 +247,7 @@ def _row(symbol: str) -> int:
 
 
 def _unreadable(formula: str, at: int) -> LimitError:
+    """Make the error for a formula that cannot be parsed at character `at`."""
     allowed = "element symbols with counts and parentheses, such as C15H17N or Ca5(PO4)3OH"
     said = f"formula {formula!r} cannot be read at character {at + 1}"
     return LimitError.instead(said, formula, allowed, at=at)

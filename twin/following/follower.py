@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
 
-from flexdt.twin.following.mirror import MOST_WAITING, Alarm, Heard, Mirror, Waiting
+from flexdt.twin.following.mirror import MAX_WAITING, Alarm, Heard, Mirror, Waiting
 from flexdt.twin.machine.description import Machine, Profile, unknown_axis
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.dry_run import CollisionCheck, check_plan
@@ -32,31 +32,37 @@ from flexdt.twin.script.planning.simulated_script import Simulation
 from flexdt.twin.script.planning.time_ranges import Range, step_range, total_range
 from flexdt.twin.script.problems import Severity
 
-NEAR_LIMIT: Final = 0.5
-"""Distance of a target from a limit that is worth telling [mm or deg]."""
+NEAR_LIMIT_DISTANCE: Final = 0.5
+"""Distance of a target from a limit below which a warning is given [mm or deg]."""
 NEAR_PART_MM: Final = 5.0
-"""Clearance on the way, beyond the safety margin, that is worth telling."""
-AT_TARGET: Final = 0.02
-"""How far from its target a motor may stand [mm or deg]; the public log's are within 0.005."""
+"""Clearance on the way, beyond the safety margin, below which a warning is given [mm]."""
+TARGET_TOLERANCE: Final = 0.02
+"""Largest distance of a motor from its target at rest [mm or deg]; 0.005 in the public log."""
 SLACK_S: Final = 0.3
-"""What sockets, and the age of a reading when it is sent, add to a time."""
-DRIFT_S: Final = 0.25
-"""By how much the delay behind the predicted path may grow during a move."""
-SILENT_S: Final = 2.5
-"""The interface's rules ask for one message a second of a command that lasts."""
-FORGET_S: Final = 60.0
-"""A command that has said nothing for so long, and beyond its range, has no end any more."""
-WIDER: Final = 3.0
-"""By how many widths of a 90 % range a time lies beyond it that is worth telling: a good machine's
-lies there less than once a day, for a normal or log-normal spread of up to 50 %."""
-_OF_A_MOVE: Final = ("limit", "limit_near", "slow", "fast", "off_path", "offset", "moved")
-"""What was told of an axis's last move is told anew of its next."""
-_OF_ONE_COMMAND: Final = {
+"""Allowance for sockets and for the age of a reading when it is sent [s]."""
+MAX_DRIFT_S: Final = 0.25
+"""Largest growth of the delay behind the predicted path during a move [s]."""
+MAX_SILENCE_S: Final = 2.5
+"""Longest silence about a command under way [s]; the interface asks for one message a
+second."""
+FORGOTTEN_AFTER_S: Final = 60.0
+"""Silence, beyond its range, after which a command has no end any more [s]."""
+WIDENING_WIDTHS: Final = 3.0
+"""Widths of a 90 % range by which a time must be outside it for an alarm.
+
+A good machine's is that far out less than once a day, for a normal or log-normal spread
+of up to 50 %.
+"""
+_KINDS_OF_A_MOVE: Final = ("limit", "limit_near", "slow", "fast", "off_path", "offset", "moved")
+"""Kinds of alarms about an axis's last move, cleared by the next."""
+_KIND_OF_PROBLEM: Final = {
     "limit": "limit", "limit_clamped": "limit", "mode": "mode", "roi": "roi",
     "xray_never_ready": "xray_never_ready",
 }  # fmt: skip
-"""Problems that a plan of one command tells, and the kinds of alarm that they are; the others, such
-as no image to save, come from planning it alone."""
+"""Codes of problems that the plan of one command can find, and their kinds of alarm.
+
+The others, such as no image to save, come from planning it alone.
+"""
 
 
 @dataclass(frozen=True)
@@ -87,7 +93,7 @@ class Follower:
     collision: CollisionCheck | None = None
 
     def hear(self, mirror: Mirror, heard: Heard, now: float) -> Mirror:
-        """The machine after a message.
+        """Update the mirror with a message.
 
         Args:
             mirror: before it.
@@ -103,7 +109,7 @@ class Follower:
             return mirror
         if waiting is not None:
             about = waiting.heard.words[0]
-            if ("silent", about) in mirror.active and now - waiting.told_s > SILENT_S:
+            if ("silent", about) in mirror.active and now - waiting.told_s > MAX_SILENCE_S:
                 mirror = replace(mirror, speaks=False)
             mirror = mirror.with_waiting(waiting, told_s=now).cleared(about, "silent")
         if heard.what == "FDB":
@@ -112,7 +118,7 @@ class Follower:
         return mirror if heard.what == "RCV" else self._ended(mirror, heard, waiting, now)
 
     def tick(self, mirror: Mirror, now: float) -> Mirror:
-        """The machine after time has passed without a message: what is overdue is told."""
+        """Update the mirror after time without a message: raise alarms for what is overdue."""
         mirror = self._over(mirror, "", now) if mirror.ends is False else mirror
         for waiting in mirror.waiting.values():
             took, quiet, about = now - waiting.sent_s, now - waiting.told_s, waiting.heard.words[0]
@@ -121,11 +127,11 @@ class Follower:
             if expected and overdue and mirror.ends is not False:
                 mirror = self._outside(mirror, waiting, took, now)
                 mirror = replace(mirror, ends=mirror.ends or False)
-            if expected and not overdue and quiet > SILENT_S and mirror.speaks is not False:
+            if expected and not overdue and quiet > MAX_SILENCE_S and mirror.speaks is not False:
                 what = f"{waiting.heard.text!r} is under way and has said nothing for {quiet:.1f} s"
                 mirror = _alarm(mirror, now, "warning", "silent", about, what)
                 mirror = replace(mirror, speaks=mirror.speaks or False)
-            if quiet > max(FORGET_S, waiting.most_s):
+            if quiet > max(FORGOTTEN_AFTER_S, waiting.most_s):
                 mirror = _rests(mirror.finished(waiting.heard), waiting)
         for name, axis in mirror.axes.items() if mirror.ends is False else ():
             told, path = axis.heard_s or 0.0, axis.path
@@ -137,7 +143,8 @@ class Follower:
         return mirror
 
     def linked(self, mirror: Mirror, connected: bool, now: float, why: str = "") -> Mirror:
-        """The machine after the link has come up or gone down, which forgets commands under way."""
+        """Update the mirror after the link has come up or gone down, which forgets
+        commands under way."""
         if connected:
             return replace(mirror.cleared("link"), connected=True)
         axes = {n: a.at_rest for n, a in mirror.axes.items()}
@@ -146,7 +153,7 @@ class Follower:
         return _alarm(mirror, now, "error", "lost", "link", what)
 
     def told(self, mirror: Mirror, alarms: Iterable[Alarm]) -> Mirror:
-        """The machine after `ahead` has found these; those that it finds again are not new."""
+        """Update the mirror with the alarms of `ahead`; those it has already are not new."""
         found = tuple(alarms)
         still = {(a.kind, a.about) for a in found}
         kept = {k for k in mirror.active if not k[1].startswith("ahead") or k in still}
@@ -156,10 +163,17 @@ class Follower:
         return mirror
 
     def ahead(self, mirror: Mirror, now: float) -> tuple[Alarm, ...]:
-        """What goes wrong from here on: moves under way, and the rest of the script.
+        """Check the moves under way and the rest of the script, as `flexdt check` does.
 
-        This takes as long as `flexdt check` does. Motors of which nothing has been heard are
-        assumed at home, and each alarm says so.
+        This takes as long as that. Motors that have not been heard of are assumed at
+        home, and each alarm says so.
+
+        Args:
+            mirror: the machine as it is known.
+            now: time [s].
+
+        Returns:
+            Errors, doubts about the exposure, and clearances below the bound, as alarms.
         """
         under_way = [
             c.MoveAbsolute(component=name, target=axis.target)
@@ -192,6 +206,8 @@ class Follower:
     # -- commands ----------------------------------------------------------------------------
 
     def _sent(self, mirror: Mirror, heard: Heard, now: float) -> Mirror:
+        """Update the mirror with a command: prediction, place in the script, command
+        under way."""
         again = (i for i in mirror.waiting if (i[0], i[2]) == (heard.key, heard.words))
         if any(again) or (heard.named and heard.identity in mirror.ended):
             return mirror
@@ -210,11 +226,11 @@ class Follower:
         if heard.command is not None:
             mirror = self._on_script(mirror, heard.command, now)
             mirror, waiting = self._predicted(mirror, waiting, heard.command, now)
-        kept = dict(list(mirror.waiting.items())[1 - MOST_WAITING :])
+        kept = dict(list(mirror.waiting.items())[1 - MAX_WAITING :])
         return replace(mirror, waiting={**kept, heard.identity: waiting})
 
     def _over(self, mirror: Mirror, component: str, now: float) -> Mirror:
-        """The commands of a component, or of all, whose time is over have ended, told or not."""
+        """End the commands of a component, or of all, whose predicted time is over."""
         for waiting in mirror.waiting.values():
             over = now + waiting.heard.late_s - waiting.sent_s > (waiting.predicted_s or 0.0)
             if over and not waiting.superseded and component in ("", waiting.heard.words[0]):
@@ -225,7 +241,14 @@ class Follower:
     def _predicted(
         self, mirror: Mirror, waiting: Waiting, command: c.Command, now: float
     ) -> tuple[Mirror, Waiting]:
-        """The prediction of one command, from the machine as it is now."""
+        """Predict one command, from the machine as it is now, and raise its alarms.
+
+        Args:
+            mirror: the machine.
+            waiting: the command under way; its prediction is added.
+            command: the same, typed.
+            now: time [s].
+        """
         if isinstance(command, c.MoveAbsolute):
             command = replace(command, trigger=None)
         paths = {n: a.path for n, a in mirror.axes.items() if a.path is not None}
@@ -241,10 +264,10 @@ class Follower:
         moved = tuple(n for n, m in sim.motors.all.items() if m.moves and m.moves[-1][0] == now)
         about = getattr(command, "component", "") or waiting.heard.words[0]
         if isinstance(command, c.MoveAbsolute):
-            mirror = mirror.cleared(about, *_OF_A_MOVE)
+            mirror = mirror.cleared(about, *_KINDS_OF_A_MOVE)
         for p in sim.findings.problems:
-            if p.code in _OF_ONE_COMMAND and not (mirror.xrays_on is None and "xray" in p.code):
-                kind = _OF_ONE_COMMAND[p.code]
+            if p.code in _KIND_OF_PROBLEM and not (mirror.xrays_on is None and "xray" in p.code):
+                kind = _KIND_OF_PROBLEM[p.code]
                 mirror = _alarm(mirror, now, p.severity, kind, about, p.message)
         low, high = _bounds(step, self.machine)
         delay = max(0.0, high - step.computed_s)
@@ -263,15 +286,16 @@ class Follower:
         )
 
     def _near_limit(self, mirror: Mirror, name: str, target: float, now: float) -> Mirror:
+        """Raise an alarm if a target is near a limit."""
         axis = self.machine.axes[name]
         left = min(target - axis.lower, axis.upper - target)
-        if left >= NEAR_LIMIT or ("limit", name) in mirror.active:
+        if left >= NEAR_LIMIT_DISTANCE or ("limit", name) in mirror.active:
             return mirror
         what = f"{name} goes to {target:g} {axis.unit}, {left:g} from a limit"
         return _alarm(mirror, now, "warning", "limit_near", name, what)
 
     def _on_script(self, mirror: Mirror, command: c.Command, now: float) -> Mirror:
-        """Where in the script this command is."""
+        """Find the command in the script: advance, or raise an alarm."""
         if self.script is None:
             return mirror
         bare, lines, at = _bare(command), self._bare, mirror.next_line
@@ -294,16 +318,19 @@ class Follower:
 
     @cached_property
     def _bare(self) -> tuple[c.Command, ...]:
+        """Commands of the script without place, wait and times."""
         return () if self.script is None else tuple(map(_bare, self.script.commands))
 
     @cached_property
     def _steps(self) -> tuple[PlanStep, ...]:
+        """Predicted steps of the script, from the machine's home."""
         if self.script is None:
             return ()
         start = Mirror.of(self.machine).start
         return tuple(simulated(tuple(self.script.commands), self.machine, start).steps)
 
     def _next(self, mirror: Mirror) -> str:
+        """Describe the script's next command."""
         if self.script is None or mirror.next_line >= len(self.script.commands):
             return "the script's end"
         command = self.script.commands[mirror.next_line]
@@ -312,6 +339,7 @@ class Follower:
     # -- replies -----------------------------------------------------------------------------
 
     def _ended(self, mirror: Mirror, heard: Heard, waiting: Waiting | None, now: float) -> Mirror:
+        """Update the mirror with the end of a command: record, range, positions, settings."""
         command = heard if waiting is None else waiting.heard
         unheard = waiting is None and heard.what == "ACK"
         mirror = replace(mirror.finished(command, unheard), ends=True)
@@ -343,7 +371,7 @@ class Follower:
         return _after(mirror, waiting.heard.command, self.machine, now)
 
     def _arrived(self, mirror: Mirror, waiting: Waiting, heard: Heard, now: float) -> Mirror:
-        """A move has ended: where, and with which limits, as its reply says."""
+        """Update positions, limits and rates with the reply at the end of a move."""
         axis = waiting.heard.words[0]
         motor = motor_reply(reply_bytes(heard.reply))
         at = motor.position if motor is not None else _number(heard.reply)
@@ -359,15 +387,15 @@ class Follower:
         return mirror if motor is None else self._compared(mirror, name, motor, now)
 
     def _arrival(self, mirror: Mirror, name: str, there: float, meant: float, now: float) -> Mirror:
-        """Where a motor stands beside where its move led."""
-        if abs(there - meant) <= AT_TARGET:
+        """Raise an alarm if a motor is not where its move led."""
+        if abs(there - meant) <= TARGET_TOLERANCE:
             return mirror
         unit = self.machine.axes[name].unit
         what = f"{name} stands at {there:.6g} {unit} after a move to {meant:.6g}"
         return _alarm(mirror, now, "error", "offset", name, what)
 
     def _compared(self, mirror: Mirror, name: str, motor: MotorReply, now: float) -> Mirror:
-        """Limits and rates of a motor's own reply beside those of the machine file."""
+        """Compare limits and rates of a motor's reply with those of the machine file."""
         axis = self.machine.axes[name]
         for what, theirs, ours in (
             ("limits", (motor.lower, motor.upper), (axis.lower, axis.upper)),
@@ -383,7 +411,14 @@ class Follower:
         return mirror.with_axis(name, speed=motor.speed, acceleration=motor.acceleration)
 
     def _read(self, mirror: Mirror, heard: Heard, waiting: Waiting | None, now: float) -> Mirror:
-        """Feedback, or the answer to a question: a motor's position is compared with its path."""
+        """Compare a reading of a motor's position with its predicted path.
+
+        Args:
+            mirror: the machine.
+            heard: feedback, or the answer to a question.
+            waiting: the command it belongs to, or None.
+            now: time [s].
+        """
         asks = heard.asks or (waiting.heard.asks if waiting is not None else "")
         axis, motor = heard.words[0], motor_reply(reply_bytes(heard.reply))
         at = motor.position if motor is not None else _number(heard.reply)
@@ -400,43 +435,44 @@ class Follower:
         if path is None:
             mirror = mirror.with_axis(name, position=x, target=x, heard_s=now)
             moved = waiting is None and heard.words[1].startswith("move")
-            if seen.heard_s is not None and abs(x - seen.position) > AT_TARGET and not moved:
+            if seen.heard_s is not None and abs(x - seen.position) > TARGET_TOLERANCE and not moved:
                 stood = f"not at {seen.position:.6g}, and no move of it was heard"
                 what = f"{name} stands at {x:.6g} {unit}, {stood}"
                 mirror = _alarm(mirror, now, "error", "moved", name, what)
             return mirror
-        arrived = abs(x - path.target) <= AT_TARGET
+        arrived = abs(x - path.target) <= TARGET_TOLERANCE
         passes = path.end if arrived else path.time_at(x)
         here = mirror.with_axis(name, position=x, heard_s=now)
         if moves and passes is not None and passes < seen.passed_s:  # old, if not the last
             last = mirror.ends is False and now > path.end > seen.passed_s
             return here if last else mirror
-        if moves and passes == seen.passed_s and now - (seen.heard_s or now) < SILENT_S:
+        if moves and passes == seen.passed_s and now - (seen.heard_s or now) < MAX_SILENCE_S:
             return mirror  # that one once more
-        if arrived or abs(x - path.pieces[0].position) <= AT_TARGET:
+        if arrived or abs(x - path.pieces[0].position) <= TARGET_TOLERANCE:
             return here if passes is None else here.with_axis(name, passed_s=passes)
         if passes is None:
             what = f"{name} is at {x:.6g} {unit}, on no way to {path.target:.6g}"
             return _alarm(here, now, "error", "off_path", name, what)
         least, most = now - heard.late_s - passes, now - passes
         first = seen.behind_s or (least, most)
-        if least > seen.delay_s + SLACK_S or least - first[1] > DRIFT_S:
+        if least > seen.delay_s + SLACK_S or least - first[1] > MAX_DRIFT_S:
             what = f"{name} is slow: {least:.2f} s behind the predicted path at {x:.6g} {unit}"
             here = _alarm(here, now, "error", "slow", name, what)
-        elif most + seen.begun_s < -SLACK_S or (most < 0.0 and first[0] - most > DRIFT_S):
+        elif most + seen.begun_s < -SLACK_S or (most < 0.0 and first[0] - most > MAX_DRIFT_S):
             what = f"{name} is fast: {-most:.2f} s ahead of the predicted path at {x:.6g} {unit}"
             here = _alarm(here, now, "error", "fast", name, what)
         promptest = min(first, (least, most), key=lambda behind: behind[1])
         return here.with_axis(name, behind_s=promptest, passed_s=passes)
 
     def _motor(self, axis: str, at: float) -> tuple[str, float]:
-        """The motor that a reading is of; of a virtual axis, the one that it is read from."""
+        """Return the motor that a reading of `axis` is of, and its position."""
         virtual = self.machine.virtual_axes.get(axis)
         if virtual is None:
             return axis, at
         return virtual.of, (at - virtual.constant) / virtual.factor
 
     def _outside(self, mirror: Mirror, waiting: Waiting, took: float, now: float) -> Mirror:
+        """Raise an alarm about a time outside its range."""
         longer = "more" if took > waiting.most_s else "less"
         bounds = f"{waiting.least_s:.2f} to {waiting.most_s:.2f} s"
         what = f"{waiting.heard.text} has taken {took:.2f} s, {longer} than its range of {bounds}"
@@ -446,11 +482,12 @@ class Follower:
 def _alarm(
     mirror: Mirror, now: float, severity: Severity, kind: str, about: str, message: str
 ) -> Mirror:
+    """Add an alarm to a mirror."""
     return mirror.alarmed(Alarm(now, severity, kind, about, message))
 
 
 def _bounds(step: PlanStep, machine: Machine) -> Range:
-    """Between what times a step of a good machine lies, not once a day excepted [s].
+    """Compute bounds of a step's time that a healthy machine exceeds less than once a day [s].
 
     A time that is only assumed may be anything up to twice itself.
     """
@@ -459,12 +496,13 @@ def _bounds(step: PlanStep, machine: Machine) -> Range:
 
 
 def _wider(found: Range) -> Range:
-    more = WIDER * (found[1] - found[0])
+    """Widen a 90 % range by `WIDENING_WIDTHS` widths."""
+    more = WIDENING_WIDTHS * (found[1] - found[0])
     return max(0.0, found[0] - more), found[1] + more
 
 
 def _rests(mirror: Mirror, waiting: Waiting | None) -> Mirror:
-    """The same with the motors of a move at rest, but for those that another has sent on."""
+    """Bring the motors of a move to rest, except those that another move has sent on."""
     for name in () if waiting is None else waiting.targets:
         if waiting is not None and _stays(mirror, name, waiting):
             mirror = replace(mirror, axes={**mirror.axes, name: mirror.axes[name].at_rest})
@@ -472,12 +510,13 @@ def _rests(mirror: Mirror, waiting: Waiting | None) -> Mirror:
 
 
 def _stays(mirror: Mirror, name: str, waiting: Waiting) -> bool:
-    """Whether a motor has got no other move since."""
+    """Return whether a motor has no other move since."""
     return mirror.axes[name].mover in (None, waiting.heard.identity)
 
 
 def _bare(command: c.Command) -> c.Command:
-    """A command without its place in a text, its wait, its times and the case of its axis."""
+    """Strip a command of its place in the text, its wait, its times and the case of its
+    axis."""
     bare = replace(command, line=0, column=1, wait=c.Wait.ACK, timeout_ms=None, expected_ms=None)
     if isinstance(bare, c.MotorCommand):
         bare = replace(bare, component=bare.component.lower())
@@ -485,7 +524,7 @@ def _bare(command: c.Command) -> c.Command:
 
 
 def _flushed(mirror: Mirror, now: float) -> Mirror:
-    """The next command is sent, so whoever sends has not waited for those before it."""
+    """Record the commands that the sender has not waited for, now that another follows."""
     for waiting in mirror.waiting.values():
         if waiting.written or waiting.heard.asks:
             continue
@@ -497,7 +536,7 @@ def _flushed(mirror: Mirror, now: float) -> Mirror:
 
 
 def _line(waiting: Waiting, wait: str, took: float, reply: str) -> tuple[bytes, ...]:
-    """What the record gets of a command that a script can have."""
+    """Format the record's line of a command that a script can have."""
     command, words = waiting.heard.command, waiting.heard.words
     if waiting.written or command is None:
         return ()
@@ -507,6 +546,7 @@ def _line(waiting: Waiting, wait: str, took: float, reply: str) -> tuple[bytes, 
 
 
 def _number(text: str) -> float | None:
+    """Parse a number; None if it is none."""
     try:
         return number(text.strip(), "position")
     except ArgumentError:
@@ -514,7 +554,7 @@ def _number(text: str) -> float | None:
 
 
 def _after(mirror: Mirror, command: c.Command | None, machine: Machine, now: float) -> Mirror:
-    """The mirror as the end of a command changes it."""
+    """Apply the end of a command to the mirror's settings."""
     match command:
         case c.CameraSetting():
             return replace(mirror, camera=replace(mirror.camera, **command.arguments))

@@ -19,10 +19,10 @@ from flexdt.twin.script import commands as c
 from flexdt.twin.script.planning.plan_values import StartState
 from flexdt.twin.script.problems import Severity
 
-KEPT: Final = 100
-"""Alarms that a mirror keeps, the newest; all are counted."""
-MOST_WAITING: Final = 256
-"""Commands of which no end has come, and of which one has; the oldest are forgotten."""
+MAX_ALARMS: Final = 100
+"""Number of alarms that a mirror keeps, the newest; all are counted."""
+MAX_WAITING: Final = 256
+"""Largest number of commands without an end, and of ended ones, that are remembered."""
 
 What = Literal["SEND", "RCV", "FDB", "ACK", "ERR"]
 Identity = tuple[Hashable, int, tuple[str, str, str, str]]
@@ -56,16 +56,17 @@ class Heard:
 
     @property
     def identity(self) -> Identity:
-        """What tells a command from others, and is the same where it is heard twice."""
+        """Key, tick and words: equal for a command that is heard twice."""
         return self.key, self.tick, self.words
 
     @property
     def named(self) -> bool:
-        """Whether it has a UUID."""
+        """Whether the message has a UUID."""
         return self.key != " ".join(self.words[:2])
 
     def may_answer(self, command: Identity) -> bool:
-        """Whether this can be a reply to a command, by its UUID, or else by its words."""
+        """Return whether this can be a reply to a command, by its UUID, or else by its
+        words."""
         same = self.words[2:] in (command[2][2:], ("", ""))
         return command[0] == self.key and (self.named or same)
 
@@ -128,7 +129,7 @@ class SeenAxis:
 
     @property
     def at_rest(self) -> SeenAxis:
-        """The same without a path."""
+        """The axis without a path."""
         return replace(self, path=None, mover=None, passed_s=-math.inf, behind_s=None)
 
 
@@ -139,16 +140,16 @@ class Waiting:
     heard: Heard
     sent_s: float
     told_s: float
-    """When something was last heard of it."""
+    """Time of the last message about it."""
     predicted_s: float | None = None
     least_s: float = 0.0
     most_s: float = 0.0
     targets: Mapping[str, float] = field(default_factory=dict)
-    """Of a move: where it leads its motors."""
+    """Motor -> target of a move [mm, deg]."""
     written: bool = False
     """Whether the record has it already."""
     superseded: bool = False
-    """Whether it counts as over without an end: its time is, and its component goes on."""
+    """Whether it counts as over without an end: its time is over and its component goes on."""
 
 
 @dataclass(frozen=True)
@@ -196,7 +197,7 @@ class Mirror:
 
     @classmethod
     def of(cls, machine: Machine) -> Mirror:
-        """Before anything has been heard: homes and defaults, as nothing but assumptions."""
+        """Make the mirror before any message: homes and defaults, all of them assumed."""
         axes = {
             n: SeenAxis(a.home, a.home, a.speed, a.acceleration) for n, a in machine.axes.items()
         }
@@ -209,7 +210,7 @@ class Mirror:
 
     @property
     def assumed(self) -> tuple[str, ...]:
-        """Motors whose position nobody has told."""
+        """Motors whose position has not been heard."""
         return tuple(name for name, axis in self.axes.items() if axis.heard_s is None)
 
     @property
@@ -226,27 +227,28 @@ class Mirror:
         )
 
     def asked(self, reply: Heard) -> Waiting | None:
-        """The waiting command that this is a reply to: the one of its key.
+        """Find the waiting command that `reply` belongs to: the one of its key.
 
-        Of several it is that of the same words, then that of the same tick, then the oldest. Where
-        there is no UUID, the arguments are the same, too, or left out.
+        Of several it is that of the same words, then that of the same tick, then the
+        oldest. Where there is no UUID, the arguments are the same, too, or left out.
         """
 
         def alike(asked: Waiting) -> tuple[bool, bool]:
+            """Rank a waiting command by agreement with the reply."""
             return asked.heard.words[:2] == reply.words[:2], asked.heard.tick == reply.tick
 
         found = (w for i, w in self.waiting.items() if reply.may_answer(i))
         return max(found, key=alike, default=None)
 
     def with_waiting(self, asked: Waiting, **changes: object) -> Mirror:
-        """The same with a waiting command changed."""
+        """Change a waiting command."""
         changed = replace(asked, **changes)  # type: ignore[arg-type]
         return replace(self, waiting={**self.waiting, asked.heard.identity: changed})
 
     def finished(self, command: Heard, unheard: bool = False) -> Mirror:
-        """The same after the end of a command, which may come again."""
+        """Move a command from waiting to ended; `unheard` if only its end was heard."""
         left = {i: w for i, w in self.waiting.items() if i != command.identity}
-        kept = dict(list(self.ended.items())[1 - MOST_WAITING :])
+        kept = dict(list(self.ended.items())[1 - MAX_WAITING :])
         return replace(self, waiting=left, ended={**kept, command.identity: unheard})
 
     @property
@@ -255,31 +257,32 @@ class Mirror:
         return tuple(w.heard.text for w in self.waiting.values() if not w.superseded)
 
     def age_s(self, now: float) -> float | None:
-        """How old the last message is [s]; None where there was none."""
+        """Return the age of the last message [s]; None if there was none."""
         return None if self.heard_s is None else max(0.0, now - self.heard_s)
 
     def with_axis(self, name: str, **changes: object) -> Mirror:
-        """The same with one axis changed."""
+        """Change one axis."""
         axes = {**self.axes, name: replace(self.axes[name], **changes)}  # type: ignore[arg-type]
         return replace(self, axes=axes)
 
     def alarmed(self, alarm: Alarm) -> Mirror:
-        """The same with an alarm, unless its condition is known already."""
+        """Add an alarm, unless its condition is known already."""
         key = (alarm.kind, alarm.about)
         if key in self.active:
             return self
-        kept = (*self.alarms, alarm)[-KEPT:]
+        kept = (*self.alarms, alarm)[-MAX_ALARMS:]
         return replace(self, alarms=kept, raised=self.raised + 1, active=self.active | {key})
 
     def cleared(self, about: str, *kinds: str) -> Mirror:
-        """The same with conditions about something (of these kinds, or of all) that ended."""
+        """End the conditions about something, of these kinds or of all."""
         gone = {k for k in self.active if k[1] == about and (not kinds or k[0] in kinds)}
         return replace(self, active=self.active - gone) if gone else self
 
     def to_dict(self, now: float) -> dict[str, object]:
-        """JSON form at a moment: what is shown, and how old it is [s]."""
+        """Return the JSON form at a moment: the public fields, and their ages [s]."""
 
         def ago(then: float | None) -> float | None:
+            """Return an age to the millisecond."""
             return None if then is None else round(max(0.0, now - then), 3)
 
         return {

@@ -31,14 +31,14 @@ from flexdt.twin.geometry.conventions import (
 from flexdt.twin.signatures import File, public
 
 ROW_LENGTH = 12
-DEGENERATE = 1e-12
+MIN_SINE = 1e-12
 """Sine of an angle below which two directions count as one."""
-FULL_TURN = 360.0
-SPELT_OUT = 2
-"""Views up to which a printed geometry shows every number."""
+FULL_TURN_DEG = 360.0
+MAX_PRINTED_VIEWS = 2
+"""Largest number of views of a geometry that is printed with every number."""
 Shape2 = tuple[int, int]
-SAME = 1e-6
-"""Deviation of |u| and |v|, relative, and of the right angle that `check_cone_vec` lets pass."""
+PITCH_TOLERANCE = 1e-6
+"""Largest deviation of |u| and |v| (relative) and of the right angle in `check_cone_vec`."""
 
 
 @public
@@ -117,19 +117,20 @@ class ConeVec:
         tilts: Sequence[float] = (0.0, 0.0, 0.0),
         height: float = 0.0,
     ) -> ConeVec:
-        """A circular scan about the object frame's z axis, by its distances.
+        """Make a circular scan about the object frame's z axis from its distances.
 
         Args:
             sod: focal spot to rotation axis [mm].
             sdd: focal spot to detector [mm].
-            angles: a number of views, spread over a full turn from 0 on, or stage angles (n,)
-                [deg]. Growing angles turn the object clockwise seen from above, as ASTRA's do.
+            angles: a number of views, spread over a full turn from 0 on, or stage angles
+                (n,) [deg]. Growing angles turn the object clockwise seen from above, as
+                ASTRA's do.
             shape: detector (rows, cols).
             pixel: pitch of the pixels [mm], or (along columns, along rows).
-            offset: of the detector's centre towards growing columns (right, seen from the source)
-                and growing rows (down) [mm].
-            tilts: roll, pitch and yaw of the detector [deg], right-handed: yaw about v, then pitch
-                about the turned u, then roll about the turned normal u x v.
+            offset: of the detector's centre towards growing columns (right, seen from the
+                source) and growing rows (down) [mm].
+            tilts: roll, pitch and yaw of the detector [deg], right-handed: yaw about v,
+                then pitch about the turned u, then roll about the turned normal u x v.
             height: of focal spot and detector above the object frame's origin [mm].
 
         Raises:
@@ -160,16 +161,17 @@ class ConeVec:
         tilts: Sequence[float] = (0.0, 0.0, 0.0),
         height: float = 0.0,
     ) -> ConeVec:
-        """A helical scan about the object frame's z axis: a circular one that rises as it turns.
+        """Make a helical scan about the object frame's z axis: a circular one that rises.
 
         Args:
             sod, sdd, shape, pixel, offset, tilts: as for `circular`.
-            angles: a number of views, spread over `turns` from 0 on, or accumulated stage angles
-                (n,) [deg].
+            angles: a number of views, spread over `turns` from 0 on, or accumulated stage
+                angles (n,) [deg].
             rise: of focal spot and detector, relative to the object, in a full turn [mm];
                 negative for a scan that goes down.
             turns: of the stage, where `angles` is a number.
-            height: of focal spot and detector half-way between the first and the last view [mm].
+            height: of focal spot and detector half-way between the first and the last
+                view [mm].
 
         Raises:
             GeometryError: names the number that no scanner has.
@@ -186,7 +188,7 @@ class ConeVec:
             )
             raise GeometryError.instead(asked, [rise, turns], allowed)
         given = _stage_angles(angles, turns)
-        rises = rise * (given - (given[0] + given[-1]) / 2) / FULL_TURN
+        rises = rise * (given - (given[0] + given[-1]) / 2) / FULL_TURN_DEG
         pitch = _numbers("pixel", pixel, 2, "mm", repeated=True)
         columns, down = _numbers("offset", offset, 2, "mm")
         roll, tilt, yaw = (math.radians(a) for a in _numbers("tilts", tilts, 3, "deg"))
@@ -209,10 +211,10 @@ class ConeVec:
 
     @classmethod
     def from_astra(cls, geometry: Any, shape: Shape2 | None = None) -> ConeVec:
-        """ASTRA's geometry: `cone_vec` vectors (n, 12), or a projection geometry.
+        """Convert ASTRA's geometry: `cone_vec` vectors (n, 12), or a projection geometry.
 
-        Rows are taken as they are. In ASTRA's own `cone` geometry, and in its `geom_2vec`, v points
-        upwards, so that row 0 is the lowest.
+        Rows are taken as they are. In ASTRA's own `cone` geometry, and in its
+        `geom_2vec`, v points upwards, so that row 0 is the lowest.
 
         Args:
             geometry: vectors (n, 12) [mm], or a dictionary of type `cone` or `cone_vec`.
@@ -231,7 +233,8 @@ class ConeVec:
         return found
 
     def to_astra(self) -> dict[str, Any]:
-        """ASTRA's projection geometry of type `cone_vec`, which needs the detector's shape.
+        """Convert to ASTRA's projection geometry of type `cone_vec`; needs the detector's
+        shape.
 
         Example:
             >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=9, shape=(76, 96), pixel=0.15)
@@ -243,8 +246,8 @@ class ConeVec:
 
     @classmethod
     def from_tomosipo(cls, geometry: Any) -> ConeVec:
-        """tomosipo's cone geometry (`ts.cone` or `ts.cone_vec`), or the arguments of `ts.cone_vec`
-        by name; its vectors are (z, y, x).
+        """Convert tomosipo's cone geometry (`ts.cone`, `ts.cone_vec`), or the arguments
+        of `ts.cone_vec` by name; its vectors are (z, y, x).
 
         Raises:
             GeometryError: another geometry.
@@ -259,12 +262,14 @@ class ConeVec:
         return found
 
     def to_tomosipo(self) -> Any:
-        """tomosipo's `ts.cone_vec` geometry, which needs tomosipo and the detector's shape."""
+        """Convert to tomosipo's `ts.cone_vec` geometry; needs tomosipo and the detector's
+        shape."""
         return _formats().to_tomosipo(self)
 
     def to_cil(self) -> Any:
-        """CIL's `AcquisitionGeometry` with a pose a view (`create_Cone3D_Flex`), for images as they
-        are, (views, rows, columns); needs CIL 25 or newer and the detector's shape.
+        """Convert to CIL's `AcquisitionGeometry` with a pose a view
+        (`create_Cone3D_Flex`), for images as they are, (views, rows, columns); needs CIL
+        25 or newer and the detector's shape.
 
         Raises:
             TwinError: skew pixels, several pixel sizes, no shape; CIL is not installed.
@@ -272,31 +277,33 @@ class ConeVec:
         return _formats().to_cil(self)
 
     def to_tigre(self, like: Any = None) -> tuple[Any, FloatArray]:
-        """TIGRE's geometry and its angles [rad], for images as they are, (views, rows, columns);
-        needs TIGRE and the detector's shape.
+        """Convert to TIGRE's geometry and its angles [rad], for images as they are,
+        (views, rows, columns); needs TIGRE and the detector's shape.
 
         Args:
-            like: a `Grid` or `Volume` whose voxels TIGRE takes; None leaves nVoxel, dVoxel and
-                sVoxel to you.
+            like: a `Grid` or `Volume` whose voxels TIGRE takes; None leaves nVoxel,
+                dVoxel and sVoxel to you.
 
         Raises:
-            TwinError: skew pixels, several pixel sizes, no shape, a panel that lies flat, an object
-                that is not between source and panel; TIGRE is not installed.
+            TwinError: skew pixels, several pixel sizes, no shape, a panel that lies flat,
+                an object that is not between source and panel; TIGRE is not installed.
         """
         found: tuple[Any, FloatArray] = _formats().to_tigre(self, like)
         return found
 
     def to_leap(self, like: Any = None, *, rows_up: bool = False) -> Any:
-        """LEAP's model with this scan as its modular beam; needs LEAP and the detector's shape.
+        """Make LEAP's model with this scan as its modular beam; needs LEAP and the
+        detector's shape.
 
         Args:
             like: a `Grid` or `Volume` whose voxels LEAP takes; None is LEAP's own choice.
-            rows_up: for images turned upside down, `images[:, ::-1]`, which LEAP's filtered
-                backprojection needs; its iterative methods take images as they are.
+            rows_up: for images turned upside down, `images[:, ::-1]`, which LEAP's
+                filtered backprojection needs; its iterative methods take images as they
+                are.
 
         Raises:
-            TwinError: skew pixels, several pixel sizes, no shape, voxels that are no cubes; LEAP
-                is not installed, or refuses the geometry.
+            TwinError: skew pixels, several pixel sizes, no shape, voxels that are no
+                cubes; LEAP is not installed, or refuses the geometry.
         """
         return _formats().to_leap(self, like, rows_up)
 
@@ -304,7 +311,8 @@ class ConeVec:
     def from_rtk(
         cls, file: File, *, pixel: float | Sequence[float], shape: Shape2 | None = None
     ) -> ConeVec:
-        """RTK's circular geometry from its XML file, which knows neither pixel size nor shape.
+        """Read RTK's circular geometry from its XML file, which has neither pixel size
+        nor shape.
 
         Args:
             file: the path.
@@ -351,12 +359,12 @@ class ConeVec:
         shape: Shape2 | None = None,
         pixel: float | Sequence[float] | None = None,
     ) -> ConeVec:
-        """A geometry from a file.
+        """Load a geometry from a file.
 
         Args:
-            file: the path; its ending says the format, where `format` does not: .json (flexdt or
-                CTSimU), .npy, .txt (ASTRA's vectors), .npz (tomosipo), .cil, .tigre, .leap,
-                .csv, .xml (RTK), .toml (flexDATA).
+            file: the path; its ending says the format, where `format` does not: .json
+                (flexdt or CTSimU), .npy, .txt (ASTRA's vectors), .npz (tomosipo), .cil,
+                .tigre, .leap, .csv, .xml (RTK), .toml (flexDATA).
             format: ctsimu, rtk, astra, tomosipo, cil, tigre, leap, flexdata or csv.
             shape: detector (rows, cols), where the file does not say.
             pixel: pitch of the pixels [mm], where the file does not say.
@@ -433,7 +441,7 @@ class ConeVec:
 
     def __repr__(self) -> str:
         """One line; for up to two views it evaluates back to an equal value."""
-        if len(self) <= SPELT_OUT:
+        if len(self) <= MAX_PRINTED_VIEWS:
             shape = "" if self.detector_shape is None else f", {self.detector_shape}"
             return f"ConeVec({self.rows.tolist()!r}{shape})"
         facts = self._facts()
@@ -447,7 +455,7 @@ class ConeVec:
         return f"<table><caption>ConeVec</caption>{cells}</table>"
 
     def _facts(self) -> dict[str, str]:
-        """What a reader wants to know first."""
+        """Sizes and distances in words, for printing."""
         steps = [_span(np.linalg.norm(step, axis=1)) for step in (self.u, self.v)]
         pitch = steps[0] if steps[0] == steps[1] else " x ".join(steps)
         shape = self.detector_shape
@@ -460,8 +468,8 @@ class ConeVec:
         }
 
     def to_dict(self) -> dict[str, Any]:
-        """The value as JSON types, `{"rows": [[12 numbers], ...]}` [mm], and `detector_shape`
-        where it is known.
+        """Convert to JSON types, `{"rows": [[12 numbers], ...]}` [mm], and
+        `detector_shape` where it is known.
 
         Example:
             >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
@@ -473,10 +481,11 @@ class ConeVec:
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> ConeVec:
-        """The geometry that `to_dict` wrote.
+        """Make a geometry from the document of `to_dict`.
 
         Raises:
-            GeometryError: the rows do not have twelve finite numbers each, or the shape is none.
+            GeometryError: the rows do not have twelve finite numbers each, or the shape
+                is none.
 
         Example:
             >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
@@ -500,7 +509,7 @@ class ConeVec:
         return len(self), *self.of_shape()
 
     def of_shape(self, shape: Shape2 | None = None) -> Shape2:
-        """The detector's (rows, cols): those given, or the geometry's own.
+        """Return the detector's (rows, cols): those given, or the geometry's own.
 
         Raises:
             GeometryError: neither is known, or they contradict each other.
@@ -527,7 +536,7 @@ class ConeVec:
         return found
 
     def with_shape(self, shape: Shape2 | None) -> ConeVec:
-        """The same rows with another detector (rows, cols) about the same centre, or with none.
+        """Replace the detector's (rows, cols) about the same centre, or remove it.
 
         Example:
             >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
@@ -537,7 +546,8 @@ class ConeVec:
         return replace(self, detector_shape=shape)
 
     def plot(self, axes: Any = None) -> Any:
-        """Source, detector and rays in three dimensions; needs matplotlib (the extra `plots`).
+        """Plot source, detector and rays in three dimensions; needs matplotlib (the extra
+        `plots`).
 
         Args:
             axes: matplotlib's 3D axes to draw into; None makes a figure.
@@ -588,8 +598,8 @@ class ConeVec:
         return np.asarray(np.sum((self.detector - self.source) * self.normal, axis=1))
 
     def rays(self, shape: Shape2 | None = None) -> FloatArray:
-        """The rays of each view as a projector needs them: source, centre of the first pixel minus
-        source, u and v, (n, 12) [mm].
+        """Compute the rays of each view as a projector needs them: source, centre of the
+        first pixel minus source, u and v, (n, 12) [mm].
 
         The ray to pixel (row, column) is the second of these + column * u + row * v.
 
@@ -644,7 +654,8 @@ class ConeVec:
         return np.stack([column, row], axis=-1)
 
     def piercing_points(self, shape: Shape2 | None = None) -> FloatArray:
-        """Foot of the perpendicular from the focal spot, (n, 2) pixels (column, row).
+        """Compute the foot of the perpendicular from the focal spot, (n, 2) pixels
+        (column, row).
 
         Example:
             >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
@@ -660,7 +671,7 @@ class ConeVec:
         )
 
     def pixel_centers(self, shape: Shape2 | None = None) -> FloatArray:
-        """Positions of all pixel centres, (n, rows, cols, 3) [mm].
+        """Compute the positions of all pixel centres, (n, rows, cols, 3) [mm].
 
         Example:
             >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
@@ -677,7 +688,7 @@ class ConeVec:
         )
 
     def moved(self, rotation: npt.ArrayLike, translation: npt.ArrayLike) -> ConeVec:
-        """The geometry in another frame: points p become R p + t, steps u, v become R u, R v.
+        """Transform to another frame: points p become R p + t, steps u, v become R u, R v.
 
         Args:
             rotation: (3, 3) or (n, 3, 3).
@@ -696,7 +707,7 @@ class ConeVec:
         return ConeVec(rows, self.detector_shape)
 
     def binned(self, factor: int, shape: Shape2 | None = None) -> ConeVec:
-        """The geometry of the image binned by `factor`; surplus columns and rows are cut off.
+        """Bin the image by `factor`; columns and rows beyond a multiple of it are cut off.
 
         Args:
             factor: pixels per coarse pixel along each side.
@@ -722,7 +733,7 @@ class ConeVec:
 
 
 def check_shape(shape: Shape2) -> Shape2:
-    """(rows, cols) as positive integers, or GeometryError."""
+    """Check that (rows, cols) are positive integers; raise GeometryError otherwise."""
     rows, cols = map(operator.index, shape)
     if rows <= 0 or cols <= 0:
         what = f"detector shape {shape!r}; allowed: (rows, cols), both positive"
@@ -731,14 +742,15 @@ def check_shape(shape: Shape2) -> Shape2:
 
 
 def _stage_angles(angles: int | npt.ArrayLike, turns: float = 1.0) -> FloatArray:
-    """Stage angles [deg]: given ones, or a number of them from 0 on, evenly over whole turns.
+    """Return stage angles [deg]: given ones, or a number of them from 0 on, even over
+    whole turns.
 
     Raises:
         GeometryError: no views, or an angle that is not finite.
     """
     found: FloatArray = np.asarray(angles, dtype=np.float64)
     if isinstance(angles, int | np.integer):
-        found = np.linspace(0.0, FULL_TURN * turns, max(int(angles), 0), endpoint=False)
+        found = np.linspace(0.0, FULL_TURN_DEG * turns, max(int(angles), 0), endpoint=False)
     if found.ndim != 1 or len(found) == 0 or not np.isfinite(found).all():
         shown = angles if np.ndim(angles) == 0 else f"an array of shape {found.shape}"
         what = f"angles: {shown}; allowed: a number of views from 1, or finite angles (n,) [deg]"
@@ -749,6 +761,15 @@ def _stage_angles(angles: int | npt.ArrayLike, turns: float = 1.0) -> FloatArray
 def _numbers(
     name: str, value: object, count: int, unit: str, *, repeated: bool = False
 ) -> tuple[float, ...]:
+    """Convert `count` finite numbers, or raise GeometryError.
+
+    Args:
+        name: of the argument, for the message.
+        value: one number or several.
+        count: how many.
+        unit: for the message.
+        repeated: whether one number stands for all.
+    """
     array = np.asarray(value, dtype=np.float64)
     if array.ndim == 0 and (repeated or count == 1):
         array = np.full(count, array)
@@ -760,10 +781,12 @@ def _numbers(
 
 
 def _formats() -> Any:
+    """Return the library's module for geometry files and other programs' objects."""
     return backend("geometry files")
 
 
 def _span(values: FloatArray) -> str:
+    """Format the range of values."""
     low, high = f"{values.min():.6g}", f"{values.max():.6g}"
     return low if low == high else f"{low} to {high}"
 
@@ -786,8 +809,8 @@ def check_spread(cone_vec: ConeVec) -> ConeVec:
             for part in (cone_vec.u, cone_vec.v, cone_vec.detector - cone_vec.source)
         )
         normal = np.cross(u, v)
-        flat = ~(np.linalg.norm(normal, axis=1) > DEGENERATE)
-        level = ~(np.abs(np.einsum("ni,ni->n", normal, beam)) > DEGENERATE)
+        flat = ~(np.linalg.norm(normal, axis=1) > MIN_SINE)
+        level = ~(np.abs(np.einsum("ni,ni->n", normal, beam)) > MIN_SINE)
     bad = np.flatnonzero(flat | level)
     if len(bad):
         i = int(bad[0])
@@ -804,14 +827,16 @@ def check_spread(cone_vec: ConeVec) -> ConeVec:
 
 
 def check_cone_vec(cone_vec: ConeVec, pixel_mm: float | tuple[float, float]) -> ConeVec:
-    """The sanity checks of thesis 4.8.3; returns its argument, so it can guard an expression.
+    """Check the sanity rules of thesis 4.8.3; return the argument, so it can guard an
+    expression.
 
     Args:
         cone_vec: the geometry to check.
         pixel_mm: the binned pixel pitch that |u| and |v| must have [mm], or one for each.
 
     Raises:
-        GeometryError: names the first offending row, the check, the value and what is allowed.
+        GeometryError: names the first offending row, the check, the value and what is
+            allowed.
 
     Example:
         >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
@@ -822,7 +847,7 @@ def check_cone_vec(cone_vec: ConeVec, pixel_mm: float | tuple[float, float]) -> 
     lengths = {"|u|": np.linalg.norm(u, axis=1), "|v|": np.linalg.norm(v, axis=1)}
     pitches = pixel_mm if isinstance(pixel_mm, tuple) else (pixel_mm, pixel_mm)
     for (name, length), pitch in zip(lengths.items(), pitches, strict=True):
-        bad = np.abs(length - pitch) > SAME * pitch
+        bad = np.abs(length - pitch) > PITCH_TOLERANCE * pitch
         if bad.any():
             i = int(np.flatnonzero(bad)[0])
             raise GeometryError(
@@ -831,11 +856,11 @@ def check_cone_vec(cone_vec: ConeVec, pixel_mm: float | tuple[float, float]) -> 
                 {"row": i, "check": "pitch", "asked": float(length[i]), "allowed": pitch},
             )
     cosine = np.einsum("ni,ni->n", u, v) / (lengths["|u|"] * lengths["|v|"])
-    if (np.abs(cosine) > SAME).any():
+    if (np.abs(cosine) > PITCH_TOLERANCE).any():
         i = int(np.argmax(np.abs(cosine)))
         raise GeometryError(
             f"cone_vec row {i}: u and v are not orthogonal (cosine {cosine[i]:.3g}, allowed "
-            f"{SAME:.1g})",
+            f"{PITCH_TOLERANCE:.1g})",
             {"row": i, "check": "orthogonal", "asked": float(cosine[i])},
         )
     distance = cone_vec.source_detector_distance

@@ -50,7 +50,7 @@ ROW_DIRECTION = (0.0, 0.0, -1.0)
 
 
 def as_numbers(what: str, value: object, dtype: npt.DTypeLike = np.float64) -> npt.NDArray[Any]:
-    """An array of real numbers.
+    """Convert to an array of real numbers.
 
     Raises:
         GeometryError: it holds something else.
@@ -70,7 +70,7 @@ def as_numbers(what: str, value: object, dtype: npt.DTypeLike = np.float64) -> n
 
 
 def rotation_x(angle: float) -> FloatArray:
-    """Right-handed rotation by `angle` [rad] about +x, shape (3, 3).
+    """Compute the right-handed rotation by `angle` [rad] about +x, shape (3, 3).
 
     Example:
         >>> (rotation_x(np.pi / 2) @ [0, 1, 0]).round(9).tolist()
@@ -81,7 +81,7 @@ def rotation_x(angle: float) -> FloatArray:
 
 
 def rotation_y(angle: float) -> FloatArray:
-    """Right-handed rotation by `angle` [rad] about +y, shape (3, 3).
+    """Compute the right-handed rotation by `angle` [rad] about +y, shape (3, 3).
 
     Example:
         >>> (rotation_y(np.pi / 2) @ [0, 0, 1]).round(9).tolist()
@@ -92,7 +92,7 @@ def rotation_y(angle: float) -> FloatArray:
 
 
 def rotation_z(angle: float | FloatArray) -> FloatArray:
-    """Right-handed rotation by `angle` [rad] about +z, shape (..., 3, 3).
+    """Compute the right-handed rotation by `angle` [rad] about +z, shape (..., 3, 3).
 
     Example:
         >>> (rotation_z(np.pi / 2) @ [1, 0, 0]).round(9).tolist()
@@ -110,7 +110,8 @@ def rotation_z(angle: float | FloatArray) -> FloatArray:
 
 
 def rotation_about(axis: npt.ArrayLike, angle: float) -> FloatArray:
-    """Right-handed rotations (..., 3, 3) by `angle` [rad] about directions (..., 3) (Rodrigues).
+    """Compute right-handed rotations (..., 3, 3) by `angle` [rad] about directions (...,
+    3) (Rodrigues).
 
     Example:
         >>> bool(np.allclose(rotation_about([0, 0, 2], 0.3), rotation_z(0.3)))
@@ -126,7 +127,8 @@ def rotation_about(axis: npt.ArrayLike, angle: float) -> FloatArray:
 
 
 def stage_rotation(angle: float | FloatArray) -> FloatArray:
-    """T_world_object (rotation part) at stage angle `angle` [rad]: clockwise from above.
+    """Compute T_world_object (rotation part) at stage angle `angle` [rad]: clockwise from
+    above.
 
     Example:
         >>> (stage_rotation(np.pi / 2) @ [1, 0, 0]).round(9).tolist()  # clockwise from above
@@ -136,7 +138,8 @@ def stage_rotation(angle: float | FloatArray) -> FloatArray:
 
 
 def from_unity(vector: npt.ArrayLike) -> FloatArray:
-    """Unity's (x, y, z) of the thesis, shape (..., 3), to the world's: (x, z, y); its own inverse.
+    """Convert Unity's (x, y, z) of the thesis, shape (..., 3), to the world's (x, z, y);
+    its own inverse.
 
     Example:
         >>> from_unity([1.0, 2.0, 3.0]).tolist()
@@ -162,6 +165,9 @@ def turn_detector(
         >>> u, v = turn_detector([1, 0, 0], [0, 0, -1], yaw=0.0, pitch=0.0, roll=np.pi / 2)
         >>> u.round(9).tolist()  # seen from the source, columns now grow downwards
         [0.0, 0.0, -1.0]
+
+    Returns:
+        Turned u and v, (..., 3) [mm].
     """
     u1, v1 = (np.asarray(step, dtype=np.float64)[..., None] for step in (u, v))
     u1 = rotation_about(v, yaw) @ u1

@@ -19,11 +19,11 @@ from flexdt.twin.geometry.offsets import NAMES, UNITS, to_edge, to_internal
 from flexdt.twin.geometry.poses import Poses
 
 MOVABLE: Final = ("dO_x", "dO_y", "dO_z", "alpha", "dS_x", "dS_y", "dD_x", "dD_y", "dD_z")
-"""What may move: stage, turntable, focal spot and panel."""
+"""Parameters that may move: stage, turntable, focal spot and panel."""
 
 
 def require_movable(names: Sequence[str]) -> Sequence[str]:
-    """Check names of parameters that are to move.
+    """Check that named parameters may move.
 
     Raises:
         UnknownNameError: says which can.
@@ -59,12 +59,13 @@ class Motion:
         return f"<Motion: {len(self.values)} frames, {sizes}>"
 
     def near(self, other: Motion) -> bool:
-        """Whether two estimates of one motion differ by less than a hundredth of a sigma."""
+        """Return whether two estimates of one motion differ by less than a hundredth of a
+        sigma."""
         apart = np.abs(self.values - other.values)
         return bool((apart <= 0.01 * np.nan_to_num(self.sigma)).all())
 
     def applied(self, poses: Poses, sign: float = 1.0) -> Poses:
-        """Poses with the deviations added to axis, angle, source and detector, or taken away.
+        """Add the deviations to axis, angle, source and detector of poses, `sign` times.
 
         Raises:
             TwinError: another number of frames.
@@ -77,6 +78,7 @@ class Motion:
         )
 
         def shift(part: str) -> FloatArray:
+            """Return the shift of a part in the world frame, (n, 3) [mm]."""
             z = d.get(f"{part}_z", np.zeros(len(poses)))
             return from_unity(np.stack([d[f"{part}_x"], d[f"{part}_y"], z], axis=1))
 
@@ -89,7 +91,8 @@ class Motion:
         )
 
     def to_dict(self) -> dict[str, dict[str, object]]:
-        """Parameter -> {unit, values, sigmas, evidence, moves} in edge units (mm, deg)."""
+        """Convert to parameter -> {unit, values, sigmas, evidence, moves} in edge units
+        (mm, deg)."""
         return {
             name: {
                 "unit": UNITS[name],
@@ -106,7 +109,7 @@ class Motion:
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Mapping[str, object]]) -> Motion:
-        """The inverse of `to_dict`.
+        """Make a motion from the document of `to_dict`.
 
         Raises:
             TwinError: the document is not of that form; the message names the parameter.

@@ -17,8 +17,10 @@ from typing import Final
 from flexdt.twin.errors import GeometryError, UnknownNameError
 
 _IN_DEG: Final = ("alpha", "det_roll", "det_pitch", "det_yaw", "axis_tilt_x", "axis_tilt_z")
-MOST_TILT_DEG: Final = 45.0
-ANGLE_SCALES: Final = (0.5, 2.0)
+MAX_TILT_DEG: Final = 45.0
+"""Largest plausible tilt [deg] (assumed)."""
+ANGLE_SCALE_RANGE: Final = (0.5, 2.0)
+"""Plausible range of `angle_scale` (assumed)."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,7 @@ class Offsets:
         return cls(**{name: to_internal(name, value) for name, value in values.items()})
 
     def to_edge(self) -> dict[str, float]:
-        """All seventeen values in edge units (mm, deg, 1)."""
+        """Return all seventeen values in edge units (mm, deg, 1), by name."""
         return {f.name: to_edge(f.name, getattr(self, f.name)) for f in fields(self)}
 
 
@@ -83,8 +85,8 @@ def require_plausible(parameters: Offsets, reach_mm: float) -> None:
     Raises:
         GeometryError: an offset is out of its range; the message names it.
     """
-    ranges = {"mm": (-reach_mm, reach_mm), "deg": (-MOST_TILT_DEG, MOST_TILT_DEG),
-              "1": ANGLE_SCALES}  # fmt: skip
+    ranges = {"mm": (-reach_mm, reach_mm), "deg": (-MAX_TILT_DEG, MAX_TILT_DEG),
+              "1": ANGLE_SCALE_RANGE}  # fmt: skip
     for name, value in parameters.to_edge().items():
         low, high = ranges[UNITS[name]]
         if name != "alpha" and not low <= value <= high:

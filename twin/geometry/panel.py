@@ -23,16 +23,17 @@ import numpy as np
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
-POWERS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
-"""Of column and row, of the terms in each direction."""
-AFFINE = ("aspect", "skew")
-GAP_PX = 5.0
-"""Standard deviation of a tile's shift, wide beside any: the data determine it."""
+TERM_POWERS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
+"""Powers of column and row in the terms of each direction."""
+AFFINE_TERMS = ("aspect", "skew")
+"""Names of the terms of unequal pitches and skew."""
+GAP_SIGMA_PX = 5.0
+"""Standard deviation of a tile's shift [px], so wide that the data determine it."""
 
-MOST_LAG = 0.3
-"""Of a frame that the next one shows, at most: more is no lag but another fault."""
-LEAST_OF_LIGHT = 0.05
-"""Part of what a pixel shows that is left to it at least where lag is taken out of noise."""
+MAX_LAG = 0.3
+"""Largest part of a frame that the next one shows; more is another fault than lag."""
+MIN_LIGHT_SHARE = 0.05
+"""Least part of a pixel's light that remains after a lag is subtracted from noise."""
 
 
 @dataclass(frozen=True)
@@ -45,10 +46,11 @@ class Border:
 
 @dataclass(frozen=True)
 class PanelModel:
-    """Which terms a distortion has.
+    """Terms of a distortion.
 
     Attributes:
-        width_px: standard deviation of every coefficient, the shift [px] at half the longer side.
+        width_px: standard deviation of every coefficient, the shift [px] at half the
+            longer side.
         shape: (rows, cols) of the image.
         borders: of tiles.
     """
@@ -59,30 +61,31 @@ class PanelModel:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the coefficients."""
-        bent = [f"{way}_x{i}y{j}" for way in ("column", "row") for i, j in POWERS]
+        """Names of the coefficients, in order."""
+        bent = [f"{way}_x{i}y{j}" for way in ("column", "row") for i, j in TERM_POWERS]
         gaps = [
             f"{way}_from_{('column', 'row')[b.axis]}_{b.at:.0f}"
             for b in self.borders
             for way in ("column", "row")
         ]
-        return (*AFFINE, *bent, *gaps)
+        return (*AFFINE_TERMS, *bent, *gaps)
 
     @property
     def sigmas(self) -> FloatArray:
-        """(m,) of the priors [px]; their means are zero."""
+        """Standard deviations of the priors, (m,) [px]; their means are zero."""
         m = len(self.names)
         out = np.full(m, self.width_px)
-        out[m - 2 * len(self.borders) :] = GAP_PX
+        out[m - 2 * len(self.borders) :] = GAP_SIGMA_PX
         return out
 
     def terms(self, places: FloatArray) -> FloatArray:
-        """Shifts (..., 2, m) for a coefficient of 1 at places (..., 2), pixels (column, row)."""
+        """Compute shifts (..., 2, m) for a coefficient of 1 at places (..., 2), pixels
+        (column, row)."""
         rows, cols = self.shape
         middle, half = np.array([cols - 1, rows - 1]) / 2, max(rows, cols) / 2
         x, y = np.moveaxis((places - middle) / half, -1, 0)
         zero = np.zeros_like(x)
-        bent = [x**i * y**j for i, j in POWERS]
+        bent = [x**i * y**j for i, j in TERM_POWERS]
         across = [x, y, *bent, *[zero] * len(bent)]
         down = [-y, x, *[zero] * len(bent), *bent]
         for border in self.borders:
@@ -108,19 +111,20 @@ class Panel:
 
     @classmethod
     def flat(cls, shape: tuple[int, int]) -> Panel:
-        """Without distortion, of images (rows, cols)."""
+        """Make a panel without distortion, for images (rows, cols)."""
         model = PanelModel(0.0, shape)
         return cls(model, (0.0,) * len(model.names))
 
     def shift(self, places: FloatArray) -> FloatArray:
-        """Measured minus undistorted places [px], (..., 2), at measured places."""
+        """Compute measured minus undistorted places [px], (..., 2), at measured places."""
         if places.ndim > 2:  # row by row: the terms of a whole image take 200 MB
             return np.stack([self.shift(row) for row in places])
         return np.asarray(self.model.terms(places) @ np.array(self.coefficients))
 
     @cached_property
     def _map(self) -> tuple[Float32Array, Float32Array]:
-        """Columns and rows of the panel, (rows, cols) both, that undistorted pixels belong to."""
+        """Columns and rows of the panel, (rows, cols) both, to which undistorted pixels
+        belong."""
         rows, cols = self.model.shape
         places = np.moveaxis(np.mgrid[:rows, :cols][::-1], 0, -1).astype(np.float64)
         out = places
@@ -137,17 +141,18 @@ class Panel:
         return out[..., 0].astype(np.float32), out[..., 1].astype(np.float32)
 
     def without_lag(self, image: Float32Array, before: Float32Array) -> Float32Array:
-        """Line integrals (rows, cols) less what is of the frame that was taken before, as it shows
-        it itself: of a lag of 5 % some 0.2 % are left."""
+        """Subtract from line integrals (rows, cols) the light of the frame `before`, as
+        that shows it itself: of a lag of 5 % some 0.2 % remain."""
         share, shown = self.lag / (1.0 - self.lag), np.exp(-image)
         light = (shown - share * np.exp(-before)) / (1.0 - share)
-        return np.asarray(-np.log(np.maximum(light, LEAST_OF_LIGHT * shown)), dtype=np.float32)
+        return np.asarray(-np.log(np.maximum(light, MIN_LIGHT_SHARE * shown)), dtype=np.float32)
 
     def undistorted(self, image: Float32Array) -> Float32Array:
-        """The image (rows, cols) that a panel without distortion would have taken.
+        """Resample an image (rows, cols) as a panel without distortion would have taken it.
 
         Raises:
-            TwinError: an image of another shape than those in which the distortion was found.
+            TwinError: an image of another shape than those in which the distortion was
+                found.
         """
         import cv2
 
@@ -161,7 +166,7 @@ class Panel:
         return np.asarray(out, dtype=np.float32)
 
     def to_json(self) -> dict[str, Any]:
-        """A document of the distortion; `from_json` is its inverse."""
+        """Convert to a document; `from_json` is its inverse."""
         return {
             "model": "cubic",
             "shape": list(self.model.shape),
@@ -173,7 +178,7 @@ class Panel:
 
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> Panel:
-        """The distortion of a document.
+        """Make a panel from a document.
 
         Raises:
             TwinError: it is not one of `to_json`.
@@ -187,8 +192,8 @@ class Panel:
             model = PanelModel(0.0, (rows, cols), borders)
             found = document["coefficients"]
             lag = float(document.get("lag", 0.0))
-            if not 0.0 <= lag < MOST_LAG:
-                raise ValueError(f"lag {lag:g}; allowed: 0 to {MOST_LAG:g}")
+            if not 0.0 <= lag < MAX_LAG:
+                raise ValueError(f"lag {lag:g}; allowed: 0 to {MAX_LAG:g}")
             return cls(model, tuple(float(found[name]) for name in model.names), lag)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise TwinError(

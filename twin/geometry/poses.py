@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.errors import GeometryError
-from flexdt.twin.geometry.cone_vec import SPELT_OUT, ConeVec
+from flexdt.twin.geometry.cone_vec import MAX_PRINTED_VIEWS, ConeVec
 from flexdt.twin.geometry.conventions import (
     COLUMN_DIRECTION,
     ROW_DIRECTION,
@@ -74,7 +74,7 @@ class Poses:
 
     def __repr__(self) -> str:
         """One line; for up to two views it evaluates back to an equal value."""
-        if len(self) > SPELT_OUT:
+        if len(self) > MAX_PRINTED_VIEWS:
             turn = np.degrees(self.angle)
             return f"<Poses: {len(self)} views, {turn[0]:.6g} to {turn[-1]:.6g} deg>"
         values = ", ".join(f"{f.name}={getattr(self, f.name).tolist()!r}" for f in fields(self))
@@ -94,7 +94,7 @@ class Poses:
         pixel: float,
         angle: npt.ArrayLike,
     ) -> Poses:
-        """Poses with an upright detector of square pixels.
+        """Make poses with an upright detector of square pixels.
 
         Args:
             source, axis, detector: as the attributes, (3,) or (n, 3) [mm].
@@ -111,12 +111,13 @@ class Poses:
 
     @classmethod
     def from_cone_vec(cls, cone_vec: ConeVec) -> Poses:
-        """World poses whose nominal cone_vec is this one, to 1e-12 of its size.
+        """Make world poses whose nominal cone_vec is this one, to 1e-12 of its size.
 
-        The stage angle of a view is the direction of u seen from above, unwrapped in frame order
-        (no step is larger than half a turn), so what stands still in the world stands still here
-        and correction parameters keep their meaning. A panel turned by det_yaw is taken for a turn
-        of the sample, which only shifts alpha. The axis is the object frame's z.
+        The stage angle of a view is the direction of u seen from above, unwrapped in
+        frame order (no step is larger than half a turn), so what is at rest in the world
+        stays at rest here and correction parameters keep their meaning. A panel turned by
+        det_yaw is taken for a turn of the sample, which only shifts alpha. The axis is
+        the object frame's z.
 
         Raises:
             GeometryError: u has no horizontal part in some view; names the first.
@@ -144,18 +145,18 @@ class Poses:
 
     @property
     def pixels_per_mm(self) -> FloatArray:
-        """Columns for each mm at the rotation axis, (n,)."""
+        """Columns per mm at the rotation axis, (n,)."""
         return np.asarray(self.sdd / self.sod / np.linalg.norm(self.u, axis=1))
 
     def cone_vec(self, parameters: Offsets = NOMINAL) -> ConeVec:
-        """The geometry in the object's frame, with `parameters` added to nominal.
+        """Compute the geometry in the object's frame, with `parameters` added to nominal.
 
-        A point b of the phantom stands in the world at
-        q = c + T R(alpha + angle_scale * angle) (b + mount - tau), c = O + dO + tau,
-        with R clockwise from above and T the axis tilt (axis_tilt_x about world +x, then
-        axis_tilt_z about world +y, pivot c, assumed): thesis eq. 5.4 for T = 1. The rows are the
-        world geometry under the inverse of that map. The detector is shifted by dD, then turned
-        by det_yaw about v, det_pitch about the turned u, det_roll about the turned normal.
+        A point b of the phantom stands in the world at q = c + T R(alpha + angle_scale *
+        angle) (b + mount - tau), c = O + dO + tau, with R clockwise from above and T the
+        axis tilt (axis_tilt_x about world +x, then axis_tilt_z about world +y, pivot c,
+        assumed): thesis eq. 5.4 for T = 1. The rows are the world geometry under the
+        inverse of that map. The detector is shifted by dD, then turned by det_yaw about
+        v, det_pitch about the turned u, det_roll about the turned normal.
         """
         p = parameters
         tau = from_unity([p.tau_x, 0.0, p.tau_z])
@@ -170,6 +171,7 @@ class Poses:
         return world.moved(t_object_world, tau - self.mount)
 
     def _turned_detector(self, p: Offsets) -> tuple[FloatArray, FloatArray]:
+        """Turn the pixel steps by the detector's tilts."""
         if p.det_yaw == 0.0 and p.det_pitch == 0.0 and p.det_roll == 0.0:
             return self.u, self.v
         return turn_detector(self.u, self.v, p.det_yaw, p.det_pitch, p.det_roll)

@@ -23,8 +23,8 @@ from flexdt.twin.geometry.conventions import (
 from flexdt.twin.signatures import public
 
 AXES: Final = dict(zip(COORDINATES, (RIGHT, BEAM, UP), strict=True))
-ORTHOGONAL: Final = 1e-9
-"""How far a rotation may be from orthogonal."""
+ORTHOGONAL_TOLERANCE: Final = 1e-9
+"""Largest deviation of a rotation from orthogonal."""
 
 
 @public
@@ -60,7 +60,7 @@ class Rigid:
                 {"asked": [list(turn.shape), list(shift.shape)], "allowed": [[3, 3], [3]]},
             )
         off = float(np.abs(turn @ turn.T - np.eye(3)).max())
-        if not (off < ORTHOGONAL and np.linalg.det(turn) > 0):
+        if not (off < ORTHOGONAL_TOLERANCE and np.linalg.det(turn) > 0):
             raise GeometryError(
                 f"the matrix is no rotation: it is {off:.3g} from orthogonal, determinant "
                 f"{np.linalg.det(turn):.6g}; allowed: a rotation without a mirror",
@@ -72,7 +72,7 @@ class Rigid:
 
     @classmethod
     def translate(cls, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Rigid:
-        """A shift [mm].
+        """Make a shift [mm].
 
         Example:
             >>> Rigid.translate(1, 2, 3) @ [0.0, 0.0, 0.0]
@@ -84,7 +84,7 @@ class Rigid:
     def rotate(
         cls, axis: str | npt.ArrayLike, angle_deg: float, about: npt.ArrayLike = (0.0, 0.0, 0.0)
     ) -> Rigid:
-        """A right-handed turn.
+        """Make a right-handed turn.
 
         Args:
             axis: "x", "y", "z", or a direction (3,).
@@ -116,7 +116,7 @@ class Rigid:
     @overload
     def __matmul__(self, other: npt.ArrayLike) -> FloatArray: ...
     def __matmul__(self, other: Any) -> Any:
-        """This motion after another one, of a geometry, or of points (..., 3) [mm]."""
+        """Apply this motion to another one, to a geometry, or to points (..., 3) [mm]."""
         if isinstance(other, Rigid):
             return Rigid(self.turn @ other.turn, self.turn @ other.shift + self.shift)
         if isinstance(other, ConeVec):
@@ -141,7 +141,7 @@ class Rigid:
         return f"Rigid({self.turn.tolist()!r}, {self.shift.tolist()!r})"
 
     def to_dict(self) -> dict[str, Any]:
-        """The value as JSON types.
+        """Convert to JSON types: turn and shift.
 
         Example:
             >>> Rigid.translate(0, 0, 2).to_dict()["shift"]
@@ -151,7 +151,7 @@ class Rigid:
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> Rigid:
-        """The motion that `to_dict` wrote.
+        """Make a motion from the document of `to_dict`.
 
         Example:
             >>> move = Rigid.rotate("x", 30)

@@ -13,8 +13,8 @@ import numpy as np
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 
-MARGIN: Final = 1.001
-"""How far behind an object its virtual panel is moved, relative to its distance."""
+MOVED_BEHIND: Final = 1.001
+"""Distance of a moved panel from the source, relative to the far side of the object."""
 
 
 def stretches(cone_vec: ConeVec, points: FloatArray) -> FloatArray:
@@ -34,11 +34,11 @@ def stretches(cone_vec: ConeVec, points: FloatArray) -> FloatArray:
     depth = normal @ points.T - np.einsum("ni,ni->n", cone_vec.source, normal)[:, None]
     with np.errstate(all="ignore"):
         furthest = (depth / panel[:, None]).max(axis=1)
-    return np.where(furthest > 1.0, MARGIN * furthest, 1.0)
+    return np.where(furthest > 1.0, MOVED_BEHIND * furthest, 1.0)
 
 
 def run_through(cone_vec: ConeVec, points: FloatArray) -> ConeVec:
-    """Move the panels that cut an object behind it, with pixels so much larger: the same rays.
+    """Move the panels that cut an object behind it, and enlarge their pixels: the same rays.
 
     Args:
         cone_vec: n views.
@@ -57,7 +57,8 @@ def run_through(cone_vec: ConeVec, points: FloatArray) -> ConeVec:
 
 
 def stretched(cone_vec: ConeVec, times: FloatArray) -> ConeVec:
-    """Move panels `times` (n,) as far from the source, with pixels as many times as large."""
+    """Move panels to `times` (n,) their distance from the source, with pixels enlarged
+    alike."""
     moved = times != 1.0
     if not moved.any():
         return cone_vec
@@ -67,7 +68,8 @@ def stretched(cone_vec: ConeVec, times: FloatArray) -> ConeVec:
 
 
 def stretched_steps(rows: FloatArray, times: FloatArray) -> FloatArray:
-    """Rows (n, 12), or changes of them, of panels `times` (n,) as far from the source."""
+    """Stretch rows (n, 12), or changes of them, to panels `times` (n,) as far from the
+    source."""
     out, many = rows.copy(), times[:, None]
     out[:, 3:6] = rows[:, :3] + many * (rows[:, 3:6] - rows[:, :3])
     out[:, 6:] = many * rows[:, 6:]
@@ -75,7 +77,8 @@ def stretched_steps(rows: FloatArray, times: FloatArray) -> FloatArray:
 
 
 def relaxed_gradient(gradient: FloatArray, times: FloatArray) -> FloatArray:
-    """Derivatives (n, 12) by rows, from those by `stretched_steps` of the rows."""
+    """Convert derivatives (n, 12) by the rows of `stretched_steps` to those by the
+    original rows."""
     out, many = gradient.copy(), times[:, None]
     out[:, :3] = gradient[:, :3] + (1.0 - many) * gradient[:, 3:6]
     out[:, 3:] = many * gradient[:, 3:]

@@ -21,31 +21,31 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 FWHM = 2.3548200450309493
 """Full width at half maximum of a Gaussian of standard deviation 1."""
-SAMPLED = 0.7
+MIN_SAMPLED_SIGMA_PX = 0.7
 """Standard deviation from which samples of a Gaussian have its variance [pixels]."""
-NARROWEST = 0.02
-"""Standard deviation below which nothing is done [pixels]."""
-WIDEST = 1000.0
-"""Standard deviation of a blur at most [pixels]."""
+MIN_SIGMA_PX = 0.02
+"""Standard deviation below which an image is not blurred [pixels]."""
+MAX_SIGMA_PX = 1000.0
+"""Largest standard deviation of a blur [pixels]."""
 FREQUENCIES, FOLDS = 512, 20
 """Samples of a noise spectrum at least, and spectra on either side that are folded into it."""
 
 
 def kernel(sigma_px: float) -> Float32Array:
-    """Weights of the blur, (2 r + 1,), adding up to 1."""
+    """Compute the weights of a blur, (2 r + 1,), adding up to 1."""
     from scipy.special import ive
 
     t = sigma_px * sigma_px
     reach = max(1, int(np.ceil(4.0 * sigma_px + 1.0)))
     n = np.arange(-reach, reach + 1)
-    weights = np.exp(n * n / (-2.0 * t)) if sigma_px >= SAMPLED else ive(np.abs(n), t)
+    weights = np.exp(n * n / (-2.0 * t)) if sigma_px >= MIN_SAMPLED_SIGMA_PX else ive(np.abs(n), t)
     return np.asarray(weights / weights.sum(), dtype=np.float32)
 
 
 @lru_cache(maxsize=16)
 def noise_kernel(sigma_px: float) -> Float32Array:
-    """Weights that give white noise of the pixels' photons the spectrum it has where light spreads
-    with `sigma_px` before pixels collect it, (2 r + 1,); see `noise_spectrum`."""
+    """Compute the weights (2 r + 1,) that shape white noise as light does that spreads
+    with `sigma_px` before pixels collect it; see `noise_spectrum`."""
     reach = int(np.ceil(4.0 * sigma_px + 3.0))
     frequency = np.fft.fftfreq(max(FREQUENCIES, 4 * reach)).astype(np.float64)
     modulation = np.sqrt(noise_spectrum(frequency, sigma_px))
@@ -54,8 +54,8 @@ def noise_kernel(sigma_px: float) -> Float32Array:
 
 
 def noise_spectrum(frequency: FloatArray, sigma_px: float) -> FloatArray:
-    """Noise power of a flat image by frequency [cycles a pixel], 1 at none: light's and aperture's
-    modulation squared, with all that is folded back."""
+    """Compute the noise power of a flat image by frequency [cycles a pixel], 1 at none:
+    light's and aperture's modulation squared, with all that is folded back."""
     f = frequency[..., None] + np.arange(-FOLDS, FOLDS + 1)
     return np.asarray((np.sinc(f) ** 2 * np.exp(-((2.0 * np.pi * f * sigma_px) ** 2))).sum(axis=-1))
 
@@ -67,14 +67,24 @@ def blurred(
     *,
     weights: Callable[[float], Float32Array] = kernel,
 ) -> Float32Array:
-    """`image` (rows, cols) blurred along its rows and, by default alike, across them; edges go on
-    as their last pixel."""
+    """Blur an image (rows, cols) along its rows and, by default alike, across them; edges
+    continue as their last pixel.
+
+    Args:
+        image: float32 (rows, cols).
+        sigma_px: standard deviation along the rows [pixels].
+        across_px: across them [pixels]; None: the same.
+        weights: makes the kernel of a standard deviation.
+
+    Raises:
+        LimitError: a blur wider than `MAX_SIGMA_PX`.
+    """
     across = sigma_px if across_px is None else across_px
-    if not (widest := max(sigma_px, across)) <= WIDEST:
+    if not (widest := max(sigma_px, across)) <= MAX_SIGMA_PX:
         said = f"a blur of {widest:.3g} pixels (standard deviation)"
         cure = "a smaller focal spot, less power, less magnification or larger pixels"
-        raise LimitError.instead(said, widest, f"{WIDEST:g}, by {cure}")
-    if widest < NARROWEST:
+        raise LimitError.instead(said, widest, f"{MAX_SIGMA_PX:g}, by {cure}")
+    if widest < MIN_SIGMA_PX:
         return image
     import cv2
 
@@ -84,8 +94,14 @@ def blurred(
 
 
 def spot_blur_px(view: FloatArray, spot_mm: float, towards_mm: float = 0.0) -> float:
-    """Standard deviation of the focal spot's image at the magnification of what stands on the
-    rotation axis, or `towards_mm` nearer to the source [pixels]."""
+    """Compute the standard deviation of the focal spot's image at the rotation axis, or
+    `towards_mm` nearer to the source [pixels].
+
+    Args:
+        view: cone_vec row (12,) [mm].
+        spot_mm: focal spot, full width at half maximum [mm].
+        towards_mm: distance from the axis towards the source [mm].
+    """
     source, centre, u, v = view[0:3], view[3:6], view[6:9], view[9:12]
     normal = np.cross(u, v)
     to_axis, to_panel = float(-source @ normal), float((centre - source) @ normal)

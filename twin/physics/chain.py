@@ -51,7 +51,7 @@ class Chain:
 
 @lru_cache(maxsize=32)
 def beam_of(chain: Chain, kV: float) -> EffectiveBeam:
-    """Effective energies of the chain at a voltage.
+    """Compute the effective energies of the chain at a voltage [kV]; the last 32 are kept.
 
     Weights are electrons and their variance per cm2 of pixel and mAs at 1 m.
     """
@@ -64,10 +64,17 @@ def beam_of(chain: Chain, kV: float) -> EffectiveBeam:
 
 
 def weights_of(chain: Chain, kV: float) -> tuple[FloatArray, FloatArray]:
-    """What each energy adds to an open pixel's electrons and to their variance, (e,) both.
+    """Compute the contribution of each energy to an open pixel's electrons and their variance.
 
-    Per cm2 of pixel and mAs, 1 m from the source. The variance is that of a compound Poisson
-    process: photons are counted, each gives a spread amount of charge.
+    The variance is that of a compound Poisson process: photons are counted, each gives a
+    spread amount of charge.
+
+    Args:
+        chain: tube and panel.
+        kV: tube voltage [kV].
+
+    Returns:
+        (e,) both, per cm2 of pixel and mAs, 1 m from the source.
     """
     charge, variance = chain.panel.charge_of_photons()
     fluence = tube_spectrum(kV, chain.tube).fluence
@@ -78,7 +85,7 @@ def weights_of(chain: Chain, kV: float) -> tuple[FloatArray, FloatArray]:
 
 
 def mAs(exposure: ExposureSettings) -> float:
-    """Charge through the tube in one read-out [mAs]: W / kV is mA."""
+    """Compute the charge through the tube in one read-out [mAs]: W / kV is mA."""
     if not exposure.xrays_on:
         return 0.0
     return exposure.power_W / exposure.kV * exposure.exposure_ms / 1000.0
@@ -90,13 +97,14 @@ def expected_signal(
     view: npt.ArrayLike,
     exposure: ExposureSettings,
 ) -> Expected:
-    """Noise-free charge of one image.
+    """Compute the noise-free charge of one image.
 
     Args:
         chain: tube, materials, panel.
-        paths_mm: float32 (m, rows, cols), or (m, moments, rows, cols) spread evenly over the
-            exposure; one channel a substance [mm].
-        view: the cone_vec row (12,) of the image [mm]; distances give flux and focal-spot blur.
+        paths_mm: float32 (m, rows, cols), or (m, moments, rows, cols) spread evenly over
+            the exposure; one channel a substance [mm].
+        view: the cone_vec row (12,) of the image [mm]; distances give flux and focal-spot
+            blur.
         exposure: tube and time.
 
     Returns:
@@ -118,12 +126,13 @@ def expected_signal(
 
 
 def without_spot(chain: Chain) -> Chain:
-    """The chain for views from `spot_views`, whose mean has the spot's blur already."""
+    """Remove the spot's blur from a chain, for views from `spot_views`, whose mean has it."""
     return replace(chain, tube=replace(chain.tube, spot_mm_per_W=0.0, smallest_spot_mm=0.0))
 
 
 def flux_of(view: npt.ArrayLike, shape: tuple[int, int]) -> Float32Array:
-    """`flux_map` of a cone_vec row (12,): open pixel's share of the charge at 1 m, per cm2."""
+    """Compute `flux_map` of a cone_vec row (12,): the open pixel's share of the charge at
+    1 m, per cm2."""
     row = np.asarray(view, dtype=np.float64)
     away, u, v = row[0:3] - row[3:6], row[6:9], row[9:12]
     pixel_u, pixel_v = float(np.linalg.norm(u)), float(np.linalg.norm(v))
@@ -139,13 +148,18 @@ def flux_map(
     distance: float, foot_u: float, foot_v: float, pixel_u: float, pixel_v: float,
     shape: tuple[int, int],
 ) -> Float32Array:  # fmt: skip
-    """Pixel area [cm2] times inverse square of the distance relative to 1 m, times the obliquity.
+    """Compute pixel area [cm2] times inverse square of the distance relative to 1 m,
+    times the obliquity.
 
     Args:
         distance: from the source to the panel's plane [mm].
-        foot_u, foot_v: foot point of the source, from the panel's centre along u and v [mm].
+        foot_u, foot_v: foot point of the source, from the panel's centre along u and v
+            [mm].
         pixel_u, pixel_v: pitch [mm].
         shape: (rows, cols).
+
+    Returns:
+        Float32 (rows, cols), read-only; the last 16 are kept.
     """
     rows, cols = shape
     y = (np.arange(rows) - (rows - 1) / 2) * pixel_v - foot_v
@@ -173,7 +187,14 @@ class Scattered:
     def added_to(
         self, expected: Expected, chain: Chain, view: FloatArray, exposure: ExposureSettings
     ) -> Expected:
-        """The expected electrons of primary radiation and scatter together."""
+        """Add the scatter to the expected electrons of primary radiation.
+
+        Args:
+            expected: electrons without scatter.
+            chain: tube and panel.
+            view: cone_vec row (12,) [mm].
+            exposure: tube and time.
+        """
         signal, noise = weights_of(chain, exposure.kV)
         flux = flux_of(view, self.signal.shape) * np.float32(mAs(exposure))
         mean = expected.mean_e + self.signal * flux * np.float32(signal.sum())
@@ -183,11 +204,11 @@ class Scattered:
 
 @dataclass(frozen=True, eq=False)
 class Radiograph:
-    """What the X-rays of one pose do to the panel, without noise.
+    """The noise-free effect of the X-rays of one pose on the panel.
 
     Attributes:
-        integrals: (rows, cols), or (moments, rows, cols): what a logarithm of the flat-corrected
-            image would show.
+        integrals: (rows, cols), or (moments, rows, cols): what a logarithm of the
+            flat-corrected image would show.
         expected: electrons with the tube on; None in ideal physics.
     """
 
@@ -209,7 +230,7 @@ def radiographs(
     moments: int = 1,
     scatter: Sequence[Scattered] = (),
 ) -> list[Radiograph]:
-    """Images of several exposures, taken as if X-rays were on.
+    """Compute the images of several exposures, as if X-rays were on.
 
     Args:
         chain: tube, materials, panel.
@@ -234,7 +255,7 @@ def radiographs(
 def _as_line_integrals(
     chain: Chain, expected: Expected, view: FloatArray, exposure: ExposureSettings
 ) -> Float32Array:
-    """-log of the signal over the open beam's."""
+    """Compute -log of the signal over the open beam's, (rows, cols)."""
     area = np.float32(weights_of(chain, exposure.kV)[0].sum() * mAs(exposure))
     least = np.float32(1e-6)
     lines = np.log(np.maximum(area * flux_of(view, expected.mean_e.shape), least))

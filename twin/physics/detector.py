@@ -24,19 +24,21 @@ from flexdt.twin.physics.tube import Filter
 from flexdt.twin.signatures import public
 
 FULL_WELL_E = 1.6e6, 0.5e6
-"""Of a pixel in modes ending in High and Low: Konstantinidis et al., NIM A 689 (2012) 12, the same
-sensor family."""
+"""Full well of a pixel in modes ending in High and Low [electrons].
+
+Konstantinidis et al., NIM A 689 (2012) 12, the same sensor family.
+"""
 LOW_READ_NOISE = 165.0 / 360.0
 """Read noise of modes ending in Low, as a part of that of High: the same paper."""
 DARK_E_PER_S = 2000.0
-"""Assumed: of an unbinned pixel."""
+"""Dark charge of an unbinned pixel [electrons/s] (assumed)."""
 CAMERA_MODE = "HW1SW1High"
-"""Reads out the pixels as they are."""
+"""Camera mode that reads out unbinned pixels."""
 EXPOSURES_MS = 1e-6, 1e7
-"""Of one read-out [ms]."""
+"""Shortest and longest exposure of one read-out [ms]."""
 USUAL_MS = 100.0
 """Exposure of a `Detector` that states none, where no tube says how bright its images are [ms]."""
-_OPTIONAL = {"pixel_mm", "exposure_ms", "electrons_per_count", "dark_e_per_s"}
+_OPTIONAL_FIGURES = {"pixel_mm", "exposure_ms", "electrons_per_count", "dark_e_per_s"}
 _BOUNDS = {
     "pixel_mm": (1e-6, 100.0), "exposure_ms": EXPOSURES_MS, "averages": (1, 1_000_000),
     "bits": (1, 16), "electrons_per_count": (1e-18, 1e18), "electrons_per_keV": (1e-6, 1e6),
@@ -46,7 +48,7 @@ _BOUNDS = {
     "dead_fraction": (0.0, 1.0), "serial": (0, 2**63 - 1), "lag_fraction": (0.0, 1.0),
     "lag_s": (1e-6, 1e7), "long_lag_fraction": (0.0, 1.0), "long_lag_s": (1e-6, 1e7),
 }  # fmt: skip
-"""Least and most of each figure."""
+"""Smallest and largest allowed value of each figure."""
 
 
 @public
@@ -148,7 +150,7 @@ class Detector:
     def __post_init__(self) -> None:
         for name, (low, high) in _BOUNDS.items():
             value = getattr(self, name)
-            if value is not None or name not in _OPTIONAL:
+            if value is not None or name not in _OPTIONAL_FIGURES:
                 require_within(f"Detector: {name}", value, low, high)
         if isinstance(self.pixels, Mapping):
             object.__setattr__(self, "pixels", PixelGrid(**self.pixels))
@@ -160,9 +162,9 @@ class Detector:
 
     @classmethod
     def ideal(cls, **figures: Any) -> Detector:
-        """A detector whose only noise is that of the X-rays: every photon leaves all of its energy,
-        and there is no blur, pattern, dark charge, dead pixel or read noise; `figures` replace
-        fields (`response=()`: that of its scintillator).
+        """Make a detector whose only noise is that of the X-rays: every photon leaves all
+        of its energy, and there is no blur, pattern, dark charge, dead pixel or read
+        noise; `figures` replace fields (`response=()`: that of its scintillator).
 
         Example:
             >>> mean, _ = Detector.ideal(bits=16).charge_of_photons()
@@ -178,7 +180,7 @@ class Detector:
         return cls(**{"swank": 1.0, "response": all_of_it, **nothing, **figures})
 
     def of_pixels(self, pixels: PixelGrid) -> Detector:
-        """This detector with the pixels of a geometry, each with the charge that its area has.
+        """Give this detector the pixels of a geometry, each with the charge that its area has.
 
         Raises:
             LimitError: the detector states another pitch.
@@ -203,7 +205,7 @@ class Detector:
         )
 
     def camera(self, shape: tuple[int, int]) -> CameraSettings:
-        """Settings that read out all of (rows, cols) pixels.
+        """Make camera settings that read out all of (rows, cols) pixels.
 
         Example:
             >>> Detector(exposure_ms=50).camera((100, 200)).roi
@@ -219,7 +221,8 @@ class Detector:
         return (1 << self.bits) - 1
 
     def blur_px(self, camera: CameraSettings) -> tuple[float, float]:
-        """Standard deviation of the light's spread along and across the rows [image pixels].
+        """Compute the standard deviation of the light's spread along and across the rows
+        [image pixels].
 
         Example:
             >>> panel = Detector(blur_mm=0.3, pixels=PixelGrid(4, 4, 0.1))
@@ -231,10 +234,10 @@ class Detector:
         return sigma / across, sigma / up
 
     def gain(self, camera: CameraSettings) -> float:
-        """Give the electrons in each count.
+        """Compute the electrons in each count.
 
-        By default the unbinned pixel's full well fills the converter's depth, and a full well is
-        in proportion to the pixel's area: larger pixels hold more charge.
+        By default the unbinned pixel's full well fills the converter's depth, and a full
+        well is in proportion to the pixel's area: larger pixels hold more charge.
 
         Example:
             >>> panel = Detector(electrons_per_count=20)
@@ -248,7 +251,7 @@ class Detector:
         return FULL_WELL_E[_is_low(camera)] * area / 2.0**self.bits
 
     def read_noise(self, camera: CameraSettings) -> float:
-        """Standard deviation of one read-out of an image pixel [electrons].
+        """Compute the standard deviation of one read-out of an image pixel [electrons].
 
         Pixels binned on the panel are read once; so are, assumed, those binned later.
 
@@ -260,7 +263,7 @@ class Detector:
         return self.read_noise_e * (LOW_READ_NOISE if _is_low(camera) else 1.0)
 
     def dark_charge(self, camera: CameraSettings) -> float:
-        """Charge of an image pixel without X-rays [electrons/s].
+        """Compute the charge of an image pixel without X-rays [electrons/s].
 
         Example:
             >>> panel = Detector(dark_e_per_s=100.0)
@@ -271,7 +274,7 @@ class Detector:
         return each * camera.binning**2
 
     def figures(self) -> dict[str, float]:
-        """What it is by name, for data sets; without the camera's settings.
+        """List its figures by name, for data sets; without the camera's settings.
 
         Example:
             >>> Detector(bits=12).figures()["bits"]
@@ -294,10 +297,11 @@ class Detector:
         return held | {f"response_{energy:g}_keV": float(left) for energy, left in self.response}
 
     def charge_of_photons(self) -> tuple[FloatArray, FloatArray]:
-        """Mean charge of a photon of each energy [electrons], and what it adds to the variance of
-        a signal of many [electrons^2], (e,) both.
+        """Compute the mean charge of a photon of each energy [electrons], and its
+        contribution to the variance of a signal of many [electrons^2], (e,) both.
 
-        The number of photons is Poisson's, each leaves a spread energy and that a spread charge.
+        The number of photons is Poisson's, each leaves a spread energy and that a spread
+        charge.
 
         Example:
             >>> charge, variance = Detector().charge_of_photons()
@@ -319,12 +323,12 @@ class Detector:
 
 
 def _is_low(camera: CameraSettings) -> bool:
-    """Whether its mode has the low full well ("High" means the full well: assumed)."""
+    """Return whether a mode has the low full well ("High" means the full well: assumed)."""
     return camera.mode.strip().lower().endswith("low")
 
 
 def detector_of(spec: DetectorSpec) -> Detector:
-    """The detector of a machine: its own pixels and depth, all else as for the default."""
+    """Make the detector of a machine: its own pixels and depth, the default's other figures."""
     return Detector(
         pixels=spec.pixels, bits=spec.bits, long_lag_fraction=spec.long_lag_fraction,
         long_lag_s=spec.long_lag_s, response=spec.response,
@@ -342,10 +346,10 @@ class Pattern:
 
 @lru_cache(maxsize=8)
 def pattern(panel: Detector, binning: int, roi: tuple[int, int, int, int]) -> Pattern:
-    """The fixed pattern that image pixels of a mode and region of interest show.
+    """Draw the fixed pattern that image pixels of a mode and region of interest show.
 
-    The unbinned pattern belongs to the panel, so every mode and region sees the same panel. An
-    image pixel is dead when more than half of its pixels are.
+    The unbinned pattern belongs to the panel, so every mode and region sees the same
+    panel. An image pixel is dead when more than half of its pixels are.
 
     Args:
         panel: the detector.
@@ -362,6 +366,7 @@ def pattern(panel: Detector, binning: int, roi: tuple[int, int, int, int]) -> Pa
     rows, cols = (bottom - top + 1) // b, (right - left + 1) // b
 
     def blocks(values: npt.NDArray[np.float32]) -> Float32Array:
+        """Average the unbinned pixels of each image pixel."""
         part = values[top : top + rows * b, left : left + cols * b]
         mean: Float32Array = part.reshape(rows, b, cols, b).mean(axis=(1, 3), dtype=np.float32)
         return mean

@@ -19,23 +19,25 @@ from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.errors import LimitError, TwinError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
-TOLERANCE = 1e-3
-FAINTEST = 1e-4
-"""Below this transmission the error is measured against it instead (about a count of 14 bit)."""
-MOST = 48
-"""Effective energies at most; six metals at once take about 25."""
-AIM = 0.5
-"""Part of the tolerance that is aimed at; the rest is for thicknesses between."""
-OPEN_BEAM = 100.0
-"""Weight of the open beam, which all flats and all calibrations hang on."""
-THIN = 0.002
-"""Optical depth, at the energy that is weakened most, from which on thicknesses are asked."""
-CHECKED = 5
-"""Thicknesses checked for each that is chosen from."""
-ROUNDS = 6
-"""Times that thicknesses which miss are added."""
-BLOCK = 1 << 15
-"""Pixels worked on at a time, so that they stay in cache."""
+SIGNAL_TOLERANCE = 1e-3
+"""Largest relative error of the signal."""
+MIN_TRANSMISSION = 1e-4
+"""Transmission below which the error is relative to this value instead (about a count of
+14 bit)."""
+MAX_ENERGIES = 48
+"""Largest number of effective energies; six metals at once take about 25."""
+AIMED_SHARE = 0.5
+"""Part of the tolerance that the fit aims at; the rest is for thicknesses between."""
+OPEN_BEAM_WEIGHT = 100.0
+"""Weight of the open beam in the fit, on which all flats and calibrations depend."""
+MIN_OPTICAL_DEPTH = 0.002
+"""Smallest optical depth of the fitted thicknesses, at the energy that is weakened most."""
+CHECKS_PER_PATH = 5
+"""Number of thicknesses that are checked for each one of the fit."""
+MAX_ROUNDS = 6
+"""Largest number of rounds in which thicknesses outside the tolerance are added."""
+BLOCK_PIXELS = 1 << 15
+"""Number of pixels in a step, so that they stay in the cache."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +61,7 @@ class EffectiveBeam:
     worst: float
 
     def transmit(self, paths_mm: Float32Array) -> tuple[Float32Array, Float32Array]:
-        """Signal and its variance behind path lengths.
+        """Compute the signal and its variance behind path lengths.
 
         Args:
             paths_mm: float32 (m, ...) [mm].
@@ -71,8 +73,8 @@ class EffectiveBeam:
         mu = -self.mu.astype(np.float32)
         weights = np.array([self.signal, self.noise], dtype=np.float32)
         out = np.empty((2, flat.shape[1]), np.float32)
-        for start in range(0, flat.shape[1], BLOCK):
-            part = slice(start, start + BLOCK)
+        for start in range(0, flat.shape[1], BLOCK_PIXELS):
+            part = slice(start, start + BLOCK_PIXELS)
             through = np.exp(np.einsum("mk,mp->kp", mu, flat[:, part]))
             out[:, part] = np.einsum("wk,kp->wp", weights, through)
         mean, variance = out.reshape(2, *paths_mm.shape[1:])
@@ -84,7 +86,7 @@ def effective_beam(
     noise: FloatArray,
     substances: Sequence[Substance],
     thickest_mm: Sequence[float],
-    tolerance: float = TOLERANCE,
+    tolerance: float = SIGNAL_TOLERANCE,
 ) -> EffectiveBeam:
     """Choose effective energies.
 
@@ -97,7 +99,10 @@ def effective_beam(
 
     Raises:
         LimitError: no energy has a signal.
-        TwinError: not reached with `MOST` energies.
+        TwinError: not reached with `MAX_ENERGIES` energies.
+
+    Returns:
+        Energies whose signal is within the tolerance on thicknesses that were not fitted.
     """
     if not signal.max() > 0.0:
         said = "no photon leaves anything in the detector"
@@ -106,16 +111,16 @@ def effective_beam(
     mu = np.array([s.attenuation()[used] for s in substances]).reshape(len(substances), len(used))
     paths = sample_paths(mu, signal[used], thickest_mm)
     chosen: list[int] = []
-    for turn in range(ROUNDS):
+    for turn in range(MAX_ROUNDS):
         columns, wanted = _relative(paths, mu, signal[used])
-        chosen, weights = _pursue(columns, wanted, AIM * tolerance, chosen)
-        others = sample_paths(mu, signal[used], thickest_mm, CHECKED, turn + 1)
+        chosen, weights = _pursue(columns, wanted, AIMED_SHARE * tolerance, chosen)
+        others = sample_paths(mu, signal[used], thickest_mm, CHECKS_PER_PATH, turn + 1)
         columns, wanted = _relative(others, mu, signal[used])
         error = np.abs(columns[:, chosen] @ weights - wanted)
         worst = float(error.max())
         if worst <= tolerance:
             break
-        paths = np.concatenate([paths, others[error > AIM * tolerance]])
+        paths = np.concatenate([paths, others[error > AIMED_SHARE * tolerance]])
     else:
         raise TwinError(
             f"{len(chosen)} effective energies reach {worst:.2g}, not {tolerance:.2g}, for "
@@ -127,7 +132,7 @@ def effective_beam(
     # The variance on the same energies; its own error matters less (noise, not signal).
     spread, truth = _relative(paths, mu, noise[used])
     heavy = np.ones(len(truth))
-    heavy[0] = OPEN_BEAM
+    heavy[0] = OPEN_BEAM_WEIGHT
     variance = _non_negative(spread[:, bins] * heavy[:, None], truth * heavy)
     return EffectiveBeam(
         tuple(s.name for s in substances),
@@ -146,16 +151,17 @@ def sample_paths(
     more: int = 1,
     seed: int = 0,
 ) -> FloatArray:
-    """Path lengths (j, m) [mm] that stand for all that occur: alone, together, thin and thick.
+    """Draw path lengths (j, m) [mm] that represent all that occur: alone, together, thin
+    and thick.
 
-    Nothing is asked beyond the thickness at which a material alone lets nearly nothing through,
-    and nothing but the open beam below `THIN`.
+    They end at the thickness at which a material alone lets nearly nothing through, and
+    begin at `MIN_OPTICAL_DEPTH`, apart from the open beam.
 
     Args:
         mu: (m, e) [1/mm].
         signal: (e,) weights of the energies.
         thickest_mm: longest path through each [mm].
-        more: times as many of them.
+        more: factor on their number.
         seed: other thicknesses for each.
     """
     m = len(mu)
@@ -163,7 +169,7 @@ def sample_paths(
     rows = [np.zeros((1, m))]
     opaque = np.log(1e6 * len(signal)) / np.maximum(mu.min(axis=1, initial=np.inf), 1e-12)
     most = np.minimum(np.maximum(np.asarray(thickest_mm, dtype=np.float64), 1e-6), opaque)
-    least = np.minimum(THIN / np.maximum(mu.max(axis=1, initial=0.0), 1e-12), most / 2)
+    least = np.minimum(MIN_OPTICAL_DEPTH / np.maximum(mu.max(axis=1, initial=0.0), 1e-12), most / 2)
     for i in range(m):
         n = 60 * more
         even = (np.arange(n) + random.uniform(size=n)) / (n - 1)
@@ -183,29 +189,39 @@ def sample_paths(
 def _relative(
     paths: FloatArray, mu: FloatArray, weights: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """What each energy adds behind `paths`, (j, e), and their sum, (j,), over that sum."""
+    """Compute each energy's contribution behind `paths`, (j, e), and their sum, (j,),
+    over that sum."""
     columns = np.exp(-paths @ mu) * weights
     whole = columns.sum(axis=1)
-    scale = 1.0 / np.maximum(whole, FAINTEST * weights.sum())
+    scale = 1.0 / np.maximum(whole, MIN_TRANSMISSION * weights.sum())
     return columns * scale[:, None], whole * scale
 
 
 def _pursue(
     columns: FloatArray, wanted: FloatArray, tolerance: float, chosen: list[int]
 ) -> tuple[list[int], FloatArray]:
-    """Few columns, `chosen` and more, with weights >= 0 that add up to `wanted`: within
-    `tolerance`, or as near as `MOST` of them come.
+    """Choose few columns, `chosen` and more, whose sum with weights >= 0 is `wanted`:
+    within `tolerance`, or as near as `MAX_ENERGIES` of them come.
+
+    Args:
+        columns: (j, e) contribution of each energy.
+        wanted: (j,) their sum.
+        tolerance: largest deviation of the sum.
+        chosen: columns to begin with.
+
+    Returns:
+        Indices of the columns, and their weights.
     """
     norms = np.linalg.norm(columns, axis=0)
     heavy = np.ones(len(wanted))
-    heavy[0] = OPEN_BEAM
+    heavy[0] = OPEN_BEAM_WEIGHT
     chosen, weights = list(chosen), np.zeros(len(chosen))
     rest = wanted
     while True:
         if chosen:
             weights = _non_negative(columns[:, chosen] * heavy[:, None], wanted * heavy)
             rest = wanted - columns[:, chosen] @ weights
-            enough = len(chosen) >= min(MOST, columns.shape[1])
+            enough = len(chosen) >= min(MAX_ENERGIES, columns.shape[1])
             if enough or float(np.abs(rest).max()) <= tolerance:
                 return chosen, weights
         gain = (columns * heavy[:, None] ** 2).T @ rest / np.maximum(norms, 1e-300)
@@ -214,7 +230,7 @@ def _pursue(
 
 
 def _non_negative(columns: FloatArray, wanted: FloatArray) -> FloatArray:
-    """Least squares with weights >= 0."""
+    """Solve least squares with weights >= 0."""
     from scipy.optimize import lsq_linear, nnls
 
     try:

@@ -16,14 +16,14 @@ import numpy.typing as npt
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.machine.description import Machine
 
-BLOCK = 1 << 15
-"""Pixels worked on at a time (they stay in cache); part of the noise's definition."""
+BLOCK_PIXELS = 1 << 15
+"""Number of pixels in a step (they stay in the cache); part of the noise's definition."""
 FEW_COUNTS = 10.0
-"""Signal above dark below which a pixel counts as starved: its logarithm is mostly noise."""
-NOTICED = 1e-3
-"""Part of the pixels from which saturated or starved ones are worth a warning."""
-FEW = 30.0
-"""Below so many expected photons a Gaussian is no longer a good Poisson."""
+"""Signal above dark [counts] below which a pixel is starved: its logarithm is mostly noise."""
+WARNING_SHARE = 1e-3
+"""Part of the pixels from which saturated or starved ones cause a warning."""
+MIN_GAUSSIAN_PHOTONS = 30.0
+"""Expected photons below which a Gaussian approximates a Poisson distribution badly."""
 
 Counts = npt.NDArray[np.uint16]
 
@@ -68,12 +68,13 @@ class ExposureSettings:
 
     @property
     def duration_s(self) -> float:
-        """Of all read-outs together."""
+        """Duration of all read-outs together [s]."""
         return self.exposure_ms * self.averages / 1000.0
 
 
 def ideal_response(machine: Machine) -> IdealResponse:
-    """Give the response of `machine`: at its own settings an open beam fills 3/4 of its depth."""
+    """Make the response of `machine`: at its own settings an open beam fills 3/4 of its
+    depth."""
     model, tube = IdealResponse(), machine.tube
     scale = 2.0 ** (machine.detector.bits - model.bits)
     return IdealResponse(
@@ -87,7 +88,7 @@ def ideal_response(machine: Machine) -> IdealResponse:
 
 
 def open_beam(model: IdealResponse, settings: ExposureSettings) -> float:
-    """Signal above dark [counts] of a ray that meets nothing."""
+    """Compute the signal above dark [counts] of a ray that meets nothing."""
     if not settings.xrays_on:
         return 0.0
     kV, power, exposure = model.reference
@@ -100,7 +101,7 @@ def open_beam(model: IdealResponse, settings: ExposureSettings) -> float:
 
 
 def frame_rng(seed: int, index: int) -> np.random.Generator:
-    """The generator of one image's noise, independent of every other image's.
+    """Make the generator of one image's noise, independent of every other image's.
 
     Args:
         seed: the scan's, >= 0.
@@ -115,12 +116,12 @@ def expose(
     settings: ExposureSettings,
     rng: np.random.Generator | None = None,
 ) -> Counts:
-    """Counts of one image.
+    """Compute the counts of one image.
 
     Args:
         model: of tube and detector.
-        line_integrals: float32 (rows, cols), or (moments, rows, cols) spread evenly over the
-            exposure: intensities are averaged, as a moving object blurs. Not changed.
+        line_integrals: float32 (rows, cols), or (moments, rows, cols) spread evenly over
+            the exposure: intensities are averaged, as a moving object blurs. Not changed.
         settings: tube and camera.
         rng: generator of this frame's noise; None for the expectation, rounded.
 
@@ -132,8 +133,8 @@ def expose(
     flat = moments.reshape(len(moments), -1)
     out = np.empty(flat.shape[1], dtype=np.uint16)
     open_counts = np.float32(open_beam(model, settings))
-    for start in range(0, flat.shape[1], BLOCK):
-        part = slice(start, start + BLOCK)
+    for start in range(0, flat.shape[1], BLOCK_PIXELS):
+        part = slice(start, start + BLOCK_PIXELS)
         if open_counts > 0.0:
             signal = np.exp(-flat[:, part]).sum(axis=0) * np.float32(1.0 / len(moments))
             signal *= open_counts
@@ -153,11 +154,11 @@ def _noisy(
     rng: np.random.Generator,
     signal: Float32Array,
 ) -> Float32Array:
-    """`signal` [counts] with the Poisson and read noise of `averages` read-outs."""
+    """Add Poisson and read noise of `averages` read-outs to `signal` [counts]."""
     photons = np.float32(model.photons_per_count * settings.averages)
     variance = signal / photons
-    if settings.xrays_on and signal.min() * photons < FEW:
-        few = np.flatnonzero(signal * photons < FEW)
+    if settings.xrays_on and signal.min() * photons < MIN_GAUSSIAN_PHOTONS:
+        few = np.flatnonzero(signal * photons < MIN_GAUSSIAN_PHOTONS)
         signal[few] = rng.poisson(signal[few] * photons) / photons
         variance[few] = 0.0
     variance += np.float32(model.read_noise_counts**2 / settings.averages)

@@ -30,6 +30,7 @@ AIR: Final = Substance(
 )
 """Dry air near sea level, composition and density of NIST's tables."""
 GRAY_PER_KEV_PER_G: Final = 1.602176634e-13
+"""Dose of 1 keV in 1 g [Gy]."""
 
 
 @dataclass(frozen=True)
@@ -91,16 +92,18 @@ def pixel_reading(
 
 
 def contrast_to_noise(background: PixelValue, detail: PixelValue) -> float:
-    """Difference of two readings over the background's noise, of one pixel of one image."""
+    """Compute the difference of two readings over the background's noise, for one pixel
+    of one image."""
     return abs(background.signal - detail.signal) / background.noise
 
 
 def air_kerma_mGy(chain: Chain, exposure: ExposureSettings, distance_mm: float) -> float:
-    """Air kerma of one image at a distance from the source, nothing in between [mGy].
+    """Compute the air kerma of one image at a distance from the source, with nothing in
+    between [mGy].
 
-    The energy that photons give to electrons of air: all of it in photoelectric absorption, the
-    electron's mean share (Klein and Nishina) in Compton scattering. Bremsstrahlung of those
-    electrons, below 0.1 % here, is left in.
+    The energy that photons give to electrons of air: all of it in photoelectric
+    absorption, the electron's mean share (Klein and Nishina) in Compton scattering.
+    Bremsstrahlung of those electrons, below 0.1 % here, is left in.
 
     Args:
         chain: its tube counts.
@@ -115,7 +118,7 @@ def air_kerma_mGy(chain: Chain, exposure: ExposureSettings, distance_mm: float) 
 
 @lru_cache
 def mass_energy_transfer(substance: Substance) -> FloatArray:
-    """Mass energy-transfer coefficient at the tables' energies, (e,) [cm2/g].
+    """Compute the mass energy-transfer coefficient at the tables' energies, (e,) [cm2/g].
 
     Without fluorescence that escapes, so for light elements only.
     """
@@ -127,7 +130,8 @@ def mass_energy_transfer(substance: Substance) -> FloatArray:
 
 
 def compton_share(energy_keV: npt.ArrayLike) -> FloatArray:
-    """Mean part of a photon's energy that a free electron takes in Compton scattering, (e,)."""
+    """Compute the mean part of a photon's energy that a free electron takes in Compton
+    scattering, (e,)."""
     cosine, weight = np.polynomial.legendre.leggauss(64)
     alpha = np.atleast_1d(np.asarray(energy_keV, dtype=np.float64))[:, None] / ELECTRON_KEV
     left = 1.0 / (1.0 + alpha * (1.0 - cosine))

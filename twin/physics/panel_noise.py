@@ -16,11 +16,11 @@ import numpy as np
 
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.machine.camera import CameraSettings
-from flexdt.twin.physics.blur import NARROWEST, blurred, noise_kernel
+from flexdt.twin.physics.blur import MIN_SIGMA_PX, blurred, noise_kernel
 from flexdt.twin.physics.detector import Detector
-from flexdt.twin.physics.exposure import FEW
+from flexdt.twin.physics.exposure import MIN_GAUSSIAN_PHOTONS
 
-ROUNDING: Final = 1.0 / 12.0
+ROUNDING_COUNTS2: Final = 1.0 / 12.0
 """Variance of rounding to whole counts [counts^2]."""
 
 
@@ -63,16 +63,16 @@ class NoiseTerm:
 
 
 def draw_quanta(exposed: Exposed, rng: np.random.Generator) -> Float32Array:
-    """Draw what the charge has more than its mean, of variance / averages.
+    """Draw the deviation of the charge from its mean [electrons], of variance / averages.
 
-    Gaussian where many quanta come; where few do, whole quanta of the size that gives the variance.
+    Gaussian for many quanta; for few, whole quanta of the size that gives the variance.
     """
     mean, variance, averages = exposed.mean_e, exposed.variance_e, exposed.averages
     out = rng.standard_normal(mean.shape, dtype=np.float32)
     out *= np.sqrt(variance * np.float32(1.0 / averages))
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         quanta = mean * mean * np.float32(averages) / variance
-    few = np.flatnonzero((quanta < FEW).ravel() & (quanta > 0.0).ravel())
+    few = np.flatnonzero((quanta < MIN_GAUSSIAN_PHOTONS).ravel() & (quanta > 0.0).ravel())
     if len(few):
         each = mean.ravel()[few] / quanta.ravel()[few]
         out.ravel()[few] = (rng.poisson(quanta.ravel()[few]) - quanta.ravel()[few]) * each
@@ -89,12 +89,12 @@ def draw_electronics(exposed: Exposed, rng: np.random.Generator) -> Float32Array
 
 
 def quantum_variance(panel: Detector, camera: CameraSettings, xrays_e2: float) -> float:
-    """Give the variance that X-rays have [electrons^2]."""
+    """Return the variance of the X-rays [electrons^2]."""
     return xrays_e2
 
 
 def electronic_variance(panel: Detector, camera: CameraSettings, xrays_e2: float) -> float:
-    """Give the variance of the read noise [electrons^2]."""
+    """Return the variance of the read noise [electrons^2]."""
     return panel.read_noise(camera) ** 2
 
 
@@ -137,11 +137,12 @@ def pixel_variance(
     for term in NOISE:
         own = term.variance_e2(panel, camera, xrays_e2)
         electrons += own * kept if term.spreads else own
-    return electrons / averages / panel.gain(camera) ** 2 + ROUNDING
+    return electrons / averages / panel.gain(camera) ** 2 + ROUNDING_COUNTS2
 
 
 def _kept_by_blur(sigmas_px: tuple[float, float]) -> float:
-    """Give the part of a flat image's white noise that a pixel keeps where light spreads."""
-    if max(sigmas_px) < NARROWEST:
+    """Compute the part of a flat image's white noise that remains in a pixel where light
+    spreads."""
+    if max(sigmas_px) < MIN_SIGMA_PX:
         return 1.0
     return math.prod(float((noise_kernel(s).astype(np.float64) ** 2).sum()) for s in sigmas_px)

@@ -24,14 +24,14 @@ Signal = TypeVar("Signal", float, Float32Array)
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """What one read-out holds on average: electrons and their variance, float32 (rows, cols)."""
+    """Average content of one read-out: electrons and their variance, float32 (rows, cols)."""
 
     mean_e: Float32Array
     variance_e: Float32Array
 
 
 def expected_counts(panel: Detector, camera: CameraSettings, electrons: Signal) -> Signal:
-    """Give the counts above dark that electrons of one read-out become, not clipped.
+    """Convert electrons of one read-out to counts above dark, not clipped.
 
     Args:
         panel: the detector.
@@ -43,7 +43,7 @@ def expected_counts(panel: Detector, camera: CameraSettings, electrons: Signal) 
 
 
 def saturating_counts(panel: Detector) -> float:
-    """Give the counts above dark from which a pixel is saturated."""
+    """Return the counts above dark from which a pixel is saturated."""
     return panel.full_scale - panel.offset_counts
 
 
@@ -56,7 +56,7 @@ def read_out(
     before: Sequence[tuple[Float32Array, float]] = (),
     trapped: Float32Array | None = None,
 ) -> Counts:
-    """Read an image out as it is saved.
+    """Read an image out: add lag, noise, blur, fixed pattern, dark charge, and clip to counts.
 
     Args:
         panel: the detector.
@@ -64,16 +64,18 @@ def read_out(
         camera: mode and region of interest.
         exposure: time and averages.
         rng: generator of this frame's noise; None for the expectation.
-        before: noise-free electrons of earlier frames, each with the time [s] from its end to
-            this frame's start: what they leave behind is added.
-        trapped: electrons in traps at the frame's start, from `trapped_after`; None without long
-            lag. What they give back meanwhile is added, what they take is lost.
+        before: noise-free electrons of earlier frames, each with the time [s] from its
+            end to this frame's start: what they leave behind is added.
+        trapped: electrons in traps at the frame's start, from `trapped_after`; None
+            without long lag. What they give back meanwhile is added, what they take is
+            lost.
 
     Returns:
         uint16 (rows, cols).
 
     Raises:
-        LimitError: the signal has not the camera's shape, as one of another panel has not.
+        LimitError: the signal has not the camera's shape, as one of another panel has
+            not.
     """
     shape = (int(expected.mean_e.shape[0]), int(expected.mean_e.shape[1]))
     if shape != camera.shape:
@@ -115,7 +117,7 @@ def trapped_after(
     exposure: ExposureSettings,
     gap_s: float,
 ) -> Float32Array:
-    """Electrons in traps when the next frame starts, (rows, cols).
+    """Compute the electrons in traps when the next frame starts, (rows, cols).
 
     Args:
         panel: the detector.

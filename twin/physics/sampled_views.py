@@ -8,13 +8,14 @@ from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.physics.blur import FWHM
 
-MOST_RAYS = 16
-"""Along each side of a pixel."""
+MAX_RAYS = 16
+"""Largest number of rays along each side of a pixel."""
 
 
 def spot_views(rows: FloatArray, spot_mm: float, points: int) -> FloatArray:
-    """Views (n, 12) from so many points of a Gaussian focal spot, (n * points, 12): their mean has
-    the spot's blur at every depth. A spiral, so that no two points lie behind one another.
+    """Sample a Gaussian focal spot: views (n, 12) become (n * points, 12), whose mean has
+    the spot's blur at every depth. A spiral, so that no two points are behind one
+    another.
 
     Args:
         rows: cone_vec rows.
@@ -40,14 +41,15 @@ def check_rays(rays: int) -> None:
     Raises:
         LimitError: says what is allowed.
     """
-    if not isinstance(rays, int | np.integer) or rays not in range(1, MOST_RAYS + 1):
-        allowed = f"1 to {MOST_RAYS} along each side of a pixel"
+    if not isinstance(rays, int | np.integer) or rays not in range(1, MAX_RAYS + 1):
+        allowed = f"1 to {MAX_RAYS} along each side of a pixel"
         raise LimitError.instead(f"rays is {rays}", rays, allowed)
 
 
 def within_pixels(rows: FloatArray, rays: int) -> FloatArray:
-    """Views through a point in each of rays x rays parts of the pixels of each view, (n * rays^2,
-    12): no two in one row or column, so that edges along them come out in rays^2 steps."""
+    """Sample the pixels: views through a point in each of rays x rays parts of each
+    pixel, (n * rays^2, 12): no two in one row or column, so that edges along them come
+    out in rays^2 steps."""
     j, i = np.divmod(np.arange(rays**2)[:, None], rays)
     across = (i + (j + 0.5) / rays) / rays - 0.5
     down = (j + (rays - i - 0.5) / rays) / rays - 0.5

@@ -26,14 +26,15 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.physics.chain import Chain, Scattered, weights_of
 
 BATCHES: Final = 32
-"""Independent estimates whose spread is the standard error; also the work that threads share."""
-ROUND: Final = 8
-"""Histories of each batch before the first look at the error; their number then doubles."""
-MOST_HISTORIES: Final = 1 << 16
-"""Of each batch, when the requested error stays out of reach."""
-POINTS_AT_A_TIME: Final = 1 << 12
+"""Number of independent estimates whose spread is the standard error; threads share them."""
+FIRST_HISTORIES: Final = 8
+"""Histories of each batch before the error is first estimated; their number then doubles."""
+MAX_HISTORIES: Final = 1 << 16
+"""Largest number of histories of each batch, if the requested error is out of reach."""
+MAX_POINTS_PER_STEP: Final = 1 << 12
+"""Largest number of Sobol points of a batch in one step."""
 LATER_FAN: Final = 2
-"""Interactions after the first send their signal to every second node, half of all."""
+"""Interactions after the first send their signal to one node in this many."""
 
 Scatter = Literal["off", "mc"]
 _BOUNDS = {
@@ -47,13 +48,15 @@ _BOUNDS = {
 
 @dataclass(frozen=True, kw_only=True)
 class ScatterSettings:
-    """How the scatter of a scan is simulated.
+    """Settings of the scatter simulation.
 
     Args:
-        error: standard error of a node at which the simulation stops, as part of the image's mean.
+        error: standard error of a node at which the simulation stops, as part of the
+            image's mean.
         nodes: of the panel, about; they are spread evenly from corner to corner.
         voxels: of the grid that stands for the sample, about.
-        step_deg: views closer than this angle apart are interpolated; 0: every view by itself.
+        step_deg: views closer than this angle apart are interpolated; 0: every view by
+            itself.
         collimated: the beam ends at the panel's edges; else it lights the whole sample.
         seed: another seed draws other photons.
 
@@ -79,7 +82,7 @@ class ScatterSettings:
 
 @dataclass(frozen=True, eq=False)
 class Object:
-    """What scatters, as voxels.
+    """The scattering object as voxels.
 
     Attributes:
         amounts: float32 (z, y, x, m), parts of each substance's own density, >= 0.
@@ -117,7 +120,7 @@ class Beam:
 
     @classmethod
     def of(cls, chain: Chain, kV: float) -> Beam:
-        """Of a tube and panel at a voltage."""
+        """Make the beam of a tube and panel at a voltage [kV]."""
         signal, _ = weights_of(chain, kV)
         return cls(signal, *chain.panel.charge_of_photons())
 
@@ -146,12 +149,13 @@ class ScatterImage:
     balance: FloatArray
 
     def full(self, values: FloatArray | None = None) -> Float32Array:
-        """`mean`, or other values at the nodes, at every pixel by cubic splines."""
+        """Interpolate `mean`, or other values at the nodes, at every pixel by cubic splines."""
         return spread_out(self.mean if values is None else values, self.shape)
 
 
 def spread_out(values: FloatArray, shape: tuple[int, int]) -> Float32Array:
-    """Values at nodes, (v, u), at every pixel: cubic splines, float32 (rows, cols)."""
+    """Interpolate values at nodes, (v, u), at every pixel: cubic splines, float32 (rows,
+    cols)."""
     from scipy.interpolate import RectBivariateSpline
 
     rows, cols = shape
@@ -171,7 +175,7 @@ def scatter_image(
     settings: ScatterSettings | None = None,
     stream: int = 0,
 ) -> ScatterImage:
-    """The scatter image of one view.
+    """Simulate the scatter image of one view.
 
     Args:
         thing: the object's voxels, in the frame of `view`.
@@ -232,11 +236,11 @@ def scatter_image(
     lower, _ = thing.corners
     step = float(sections.energy_keV[1] - sections.energy_keV[0])
     done, fans = 0, np.array([nv * nu, max(1, nv * nu // LATER_FAN)])
-    each = ROUND
+    each = FIRST_HISTORIES
     while True:
         kernels.histories(
             np.stack([one.random(each) for one in sequences]), done, keys, fans,
-            kernels.ORDERS_AT_MOST, source, corner, along_u, along_v, normal, area,
+            kernels.MAX_ORDERS, source, corner, along_u, along_v, normal, area,
             nodes, per_open, thing.amounts, lower, np.array(thing.voxel_mm, dtype=np.float64),
             float(sections.energy_keV[0]), step, sections.total, sections.coherent,
             sections.incoherent, sections.root_step, sections.form, sections.shell,
@@ -248,9 +252,9 @@ def scatter_image(
         mean = batches.mean(axis=0)
         error = batches.std(axis=0, ddof=1) / np.sqrt(BATCHES)
         relative = float(error.mean() / max(mean.mean(), 1e-300))
-        if relative <= wanted.error or done >= MOST_HISTORIES:
+        if relative <= wanted.error or done >= MAX_HISTORIES:
             break
-        each = min(done, POINTS_AT_A_TIME)  # Sobol's points are even in powers of two
+        each = min(done, MAX_POINTS_PER_STEP)  # Sobol's points are even in powers of two
     whole = images.sum(axis=0) / (done * BATCHES)
     charge = float((beam.spread / beam.response)[bins] @ share)
     tally = tallies.sum(axis=0)
@@ -268,8 +272,8 @@ def scatter_image(
 def _energy_chances(
     thing: Object, row: FloatArray, mu: FloatArray, share: FloatArray
 ) -> FloatArray:
-    """Chances to draw each energy: half as it is in the open beam, half as behind the thickest
-    part, where hard photons make most of the signal."""
+    """Compute the chances to draw each energy, (s,): half as in the open beam, half as
+    behind the thickest part, where hard photons make most of the signal."""
     axis = int(np.argmax(np.abs(np.cross(row[6:9], row[9:12]))))
     columns = thing.amounts.sum(axis=2 - axis, dtype=np.float64) * thing.voxel_mm[axis]
     thickest = columns.reshape(-1, len(mu))[np.argmax(columns.sum(axis=-1))]
@@ -278,7 +282,8 @@ def _energy_chances(
 
 
 def _node_counts(shape: tuple[int, int], aspect: float, nodes: int) -> tuple[int, int]:
-    """Nodes along rows and columns, about evenly spaced, at least two and at most a pixel apart."""
+    """Choose the numbers of nodes along rows and columns, evenly spaced, two at least and
+    a pixel apart at most."""
     height, width = max(shape[0] - 1, 1) * aspect, max(shape[1] - 1, 1)
     nv = round(np.sqrt(nodes * height / width))
     nu = round(np.sqrt(nodes * width / height))
@@ -288,7 +293,8 @@ def _node_counts(shape: tuple[int, int], aspect: float, nodes: int) -> tuple[int
 def _lit(
     thing: Object, row: FloatArray, shape: tuple[int, int], collimated: bool
 ) -> tuple[float, float, float, float]:
-    """The object's shadow on the panel's plane: least column and row, greatest, from its centre."""
+    """Project the object's box on the panel's plane: least column and row, greatest, from
+    its centre."""
     source, centre, u, v = row[0:3], row[3:6], row[6:9], row[9:12]
     box = np.array(thing.corners)
     corners = np.array([[box[i, 0], box[j, 1], box[k, 2]] for i, j, k in np.ndindex(2, 2, 2)])
@@ -329,19 +335,21 @@ class ScanScatter:
         return len(self.way)
 
     def __getitem__(self, index: int) -> Scattered:
-        """Scatter of a view at every pixel; never negative, though splines may overshoot."""
+        """Interpolate the scatter of a view at every pixel; never negative, though
+        splines may overshoot."""
         return Scattered(self.signal(index), self._spread_out(index, "spread"))
 
     def of_views(self, chosen: npt.NDArray[np.intp]) -> ScanScatter:
-        """Scatter of some of the views."""
+        """Select the scatter of some of the views."""
         return replace(self, way=self.way[chosen])
 
     def signal(self, index: int) -> Float32Array:
-        """`Scattered.signal` of a view alone."""
+        """Interpolate `Scattered.signal` of a view alone."""
         return self._spread_out(index, "mean")
 
     def error(self, index: int) -> Float32Array:
-        """Standard error of a view's scatter, float32 (rows, cols), of the open beam's signal.
+        """Compute the standard error of a view's scatter, float32 (rows, cols), of the
+        open beam's signal.
 
         That of the Monte Carlo alone: interpolation between nodes and views comes on top.
         """
@@ -355,14 +363,23 @@ class ScanScatter:
 
     @cached_property
     def _stack(self) -> dict[str, FloatArray]:
+        """Arrays of the simulated views by name, (k, v, u)."""
         names = ("mean", "error", "spread")
         return {name: np.array([getattr(one, name) for one in self.images]) for name in names}
 
     def _spread_out(self, index: int, name: str) -> Float32Array:
+        """Interpolate an array of a view at every pixel, not below zero."""
         values = spread_out(self._at(index, self._stack[name]), self.images[0].shape)
         return np.maximum(values, np.float32(0.0))
 
     def _at(self, index: int, values: FloatArray, power: int = 1) -> FloatArray:
+        """Interpolate values of the simulated views (k, ...) at view `index` of the scan.
+
+        Args:
+            index: of the view.
+            values: of the simulated views.
+            power: of the weights: 2 for variances.
+        """
         if not -len(self) <= index < len(self):
             raise IndexError(f"view {index} of {len(self)}")
         place, known = self.way[index], self.known
@@ -380,11 +397,12 @@ def view_scatter(
     beam: Beam,
     settings: ScatterSettings,
 ) -> Scattered:
-    """Scatter of one view at every pixel, whatever views are simulated before or beside it.
+    """Simulate the scatter of one view at every pixel, independent of other views.
 
     Args:
         thing: the object's voxels, in the frame of `view`.
-        view: the cone_vec row (12,) [mm]; other views draw other photons, the same the same.
+        view: the cone_vec row (12,) [mm]; other views draw other photons, the same the
+            same.
         shape: the panel's (rows, cols).
         beam: spectrum and panel.
         settings: how; `step_deg` does not count.
@@ -430,7 +448,8 @@ def scan_scatter(
 
 
 def way_of(rows: FloatArray) -> FloatArray:
-    """How far source and panel have come at each view, relative to their distances, (n,) [rad]."""
+    """Compute the path length of source and panel up to each view, relative to their
+    distances, (n,) [rad]."""
     source, centre, frame = rows[:, 0:3], rows[:, 3:6], rows[:, 6:12]
     scales = (
         np.linalg.norm(source, axis=1).min(),
@@ -445,8 +464,8 @@ def way_of(rows: FloatArray) -> FloatArray:
 
 
 def _simulated(way: FloatArray, step: float) -> Sequence[int]:
-    """Indices of the views to simulate: first, last, and no way longer than `step` between two of
-    them unless it is a single stride from one view to the next."""
+    """Choose the views to simulate: first, last, and so many that no path between two is
+    longer than `step`, unless it is a single step from one view to the next."""
     chosen = [0]
     for i in range(1, len(way)):
         if i == len(way) - 1 or way[i + 1] - way[chosen[-1]] > step:

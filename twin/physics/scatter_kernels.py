@@ -29,12 +29,15 @@ from flexdt.twin.projection.kernels.compiling import inline, kernel, parallel
 SINGLE, MULTIPLE, NOISE = 0, 1, 2
 """Channels of the images: signal after one and after more interactions, variance of both."""
 TALLIES = 6
-"""Of the histories: photons that interact, are absorbed, escape; then their energies [keV]."""
+"""Number of sums over the histories: photons that interact, are absorbed, escape; then
+their energies [keV]."""
 DIMENSIONS = 6
-"""Numbers that the first interaction takes."""
+"""Number of random numbers of the first interaction."""
 ROULETTE = 0.15
-"""Below this part of its first weight a photon survives with the chance weight / ROULETTE."""
-ORDERS_AT_MOST = 100
+"""Weight, as part of the first, below which a photon survives with the chance weight /
+ROULETTE."""
+MAX_ORDERS = 100
+"""Largest number of interactions of a photon."""
 
 _GAMMA = np.uint64(0x9E3779B97F4A7C15)
 _MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
@@ -44,7 +47,8 @@ _30, _27, _31, _11 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(11)
 
 @inline
 def mixed(z: Any) -> Any:
-    """SplitMix64's finaliser: a bijection of 64 bits in which every bit depends on every bit."""
+    """Compute SplitMix64's finaliser: a bijection of 64 bits in which every bit depends
+    on every bit."""
     z = (z ^ (z >> _30)) * _MIX_1
     z = (z ^ (z >> _27)) * _MIX_2
     return z ^ (z >> _31)
@@ -52,14 +56,14 @@ def mixed(z: Any) -> Any:
 
 @inline
 def draw(state: Any) -> Any:
-    """The next state of a stream, and its number in [0, 1)."""
+    """Compute the next state of a stream, and its number in [0, 1)."""
     state = state + _GAMMA
     return state, (mixed(state) >> _11) * (1.0 / 9007199254740992.0)
 
 
 @inline
 def between(row: Any, at: Any) -> Any:
-    """Linear interpolation in an evenly spaced table."""
+    """Interpolate linearly in an evenly spaced table."""
     i = min(max(int(at), 0), len(row) - 2)
     part = at - i
     return row[i] * (1.0 - part) + row[i + 1] * part
@@ -67,7 +71,7 @@ def between(row: Any, at: Any) -> Any:
 
 @kernel
 def travel(amounts, lower, edge, p, d, mu, stop, paths):
-    """Go from p along d through the grid (Amanatides and Woo, Eurographics 1987).
+    """Walk from p along d through the grid (Amanatides and Woo, Eurographics 1987).
 
     Args:
         amounts: (nz, ny, nx, m) float32, parts of each material's own density.
@@ -148,7 +152,7 @@ def travel(amounts, lower, edge, p, d, mu, stop, paths):
 
 @inline
 def depth_of(paths: Any, mu: Any) -> float:
-    """Optical depth of path lengths."""
+    """Compute the optical depth of path lengths."""
     depth = 0.0
     for m in range(len(paths)):
         depth += paths[m] * mu[m]
@@ -157,12 +161,13 @@ def depth_of(paths: Any, mu: Any) -> float:
 
 @kernel
 def depth_drawn(number, depth):
-    """Optical depth of a forced interaction on a way of optical depth `depth`, and its weight.
+    """Draw the optical depth of a forced interaction on a path of optical depth `depth`,
+    and its weight.
 
-    Half of the chance is the exponential's, cut off at the far side; half is even, since a photon
-    that goes on to the panel is weakened as much wherever on the way it interacts. Without it thick
-    objects would be sampled at their entrance alone. Newton's steps from 0 invert the running
-    chance, which is concave, from below.
+    Half of the chance is the exponential's, cut off at the far side; half is even, since
+    a photon that goes on to the panel is weakened as much wherever on the way it
+    interacts. Without it thick objects would be sampled at their entrance alone. Newton's
+    steps from 0 invert the running chance, which is concave, from below.
     """
     hit = -math.expm1(-depth)
     t = 0.0
@@ -178,7 +183,7 @@ def depth_drawn(number, depth):
 
 @kernel
 def chosen_material(amounts, lower, edge, p, mu, number):
-    """The material that a photon meets at p, by a number in [0, 1)."""
+    """Choose the material that a photon meets at p, by a number in [0, 1)."""
     nz, ny, nx, materials = amounts.shape
     i = min(max(int((p[0] - lower[0]) / edge[0]), 0), nx - 1)
     j = min(max(int((p[1] - lower[1]) / edge[1]), 0), ny - 1)
@@ -196,8 +201,9 @@ def chosen_material(amounts, lower, edge, p, mu, number):
 
 @kernel
 def coherent_cosine(state, energy, cumulated, root_step):
-    """Angle of a coherent interaction: x^2 from the running integral of F^2, then Thomson's
-    (1 + cos^2) / 2 by rejection (Persliden, Comput. Programs Biomed. 17 (1983) 115)."""
+    """Draw the angle of a coherent interaction: x^2 from the running integral of F^2,
+    then Thomson's (1 + cos^2) / 2 by rejection (Persliden, Comput. Programs Biomed. 17
+    (1983) 115)."""
     # x = sin(angle / 2) E / hc; the tables are evenly spaced in sqrt(x), finest near 0, where
     # form factors fall. Backward (cosine -1) is x = E / hc, beyond which nothing is drawn.
     greatest = energy / HC_KEV_A
@@ -223,9 +229,9 @@ def coherent_cosine(state, energy, cumulated, root_step):
 
 @kernel
 def incoherent_cosine(state, energy, shell, root_step):
-    """Angle of an incoherent interaction, by rejection from the even distribution: Klein-Nishina,
-    at most 1 here, and S over its greatest value. Half of the trials or more succeed below 250 keV.
-    """
+    """Draw the angle of an incoherent interaction, by rejection from the even
+    distribution: Klein-Nishina, at most 1 here, and S over its greatest value. Half of
+    the trials or more succeed below 250 keV."""
     most = shell[len(shell) - 1]
     while True:
         state, number = draw(state)

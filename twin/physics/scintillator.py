@@ -27,17 +27,20 @@ K_SHELL: Final = {
 """Edge [keV], part of the absorption above it (the edge's jump in the tables), fluorescence yield
 (Krause, J. Phys. Chem. Ref. Data 8 (1979) 307), energies of K-alpha and K-beta [keV]. Of other
 elements no fluorescence escapes here."""
-ALPHA: Final = 0.81
+K_ALPHA_SHARE: Final = 0.81
 """Part of K-alpha among K photons."""
 SLICES: Final = 60
+"""Number of slices of the layer, in each of which as many photons are stopped."""
 
 
 class Deposited(NamedTuple):
-    """What a layer keeps of a photon, by energy of the tables.
+    """Energy that a layer keeps of a photon, by energy of the tables.
 
     Attributes:
-        mean: (e,) part of the energy that is kept on average; photons that pass keep nothing there.
-        square: (e,) mean square of that part; mean^2 / square is Swank's factor of the deposit.
+        mean: (e,) part of the energy that is kept on average; photons that pass keep
+            nothing there.
+        square: (e,) mean square of that part; mean^2 / square is Swank's factor of the
+            deposit.
     """
 
     mean: FloatArray
@@ -46,7 +49,7 @@ class Deposited(NamedTuple):
 
 @lru_cache(maxsize=64)
 def deposited(screen: Filter) -> Deposited:
-    """Part of a photon's energy that a layer keeps.
+    """Compute the part of a photon's energy that a layer keeps.
 
     Example:
         >>> csi = Filter(Substance.of("CsI", "CsI", 4.51), 0.2)
@@ -69,7 +72,8 @@ def deposited(screen: Filter) -> Deposited:
     here = np.broadcast_to((stopped / stopping / SLICES)[:, None], depth.shape)
 
     def escaping(mu: FloatArray) -> FloatArray:
-        """Of what starts evenly into all directions, (e, slice)."""
+        """Compute the part that escapes of what starts evenly into all directions, (e,
+        slice)."""
         return np.asarray(
             (expn(2, mu[..., None] * depth) + expn(2, mu[..., None] * (thick - depth))) / 2.0
         )
@@ -80,7 +84,7 @@ def deposited(screen: Filter) -> Deposited:
         edge, jump, fluorescence, lines = K_SHELL.get(symbol, (np.inf, 0.0, 0.0, (0.0, 0.0)))
         alone = Substance(symbol, ((symbol, 1.0),), part * substance.density_g_cm3)
         amount = jump * fluorescence * photo * alone.attenuation() / total * (energy > edge)
-        for line, often in zip(lines, (ALPHA, 1.0 - ALPHA), strict=True):
+        for line, often in zip(lines, (K_ALPHA_SHARE, 1.0 - K_ALPHA_SHARE), strict=True):
             lost = escaping(np.interp([line], energy, stopping))
             escapes = amount * often * (here * lost).sum(axis=1)
             kept -= escapes * line

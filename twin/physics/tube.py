@@ -22,8 +22,8 @@ from flexdt.twin.physics.exposure import ExposureSettings
 from flexdt.twin.signatures import public
 
 ALUMINIUM = Substance.parse("Al@2.70")
-NOTHING = 1e-20
-"""Photons per cm2 and mAs at 1 m, below which no exposure sees one."""
+MIN_PHOTONS = 1e-20
+"""Photons per cm2 and mAs at 1 m below which a beam counts as stopped."""
 
 
 _FILTER = "tube_filter_"
@@ -39,13 +39,13 @@ class Filter:
 
 @dataclass(frozen=True)
 class TubeModel:
-    """What the beam of a tube depends on besides kV and power. All defaults are assumed.
+    """Properties of a tube's beam besides kV and power. All defaults are assumed.
 
     Attributes:
-        filters: from the anode to the sample; 0.5 mm aluminium stands for window and inherent
-            filtration.
-        spot_mm_per_W: the electron beam of microfocus tubes is widened with power so that the
-            anode does not melt; about a micrometre a watt is usual.
+        filters: from the anode to the sample; 0.5 mm aluminium stands for window and
+            inherent filtration.
+        spot_mm_per_W: the electron beam of microfocus tubes is widened with power so that
+            the anode does not melt; about a micrometre a watt is usual.
         smallest_spot_mm: focal spot at little power (full width at half maximum).
         spot_points: from which the twin's rays start; 1 for one blur of the whole image.
     """
@@ -56,11 +56,11 @@ class TubeModel:
     spot_points: int = 1
 
     def focal_spot_mm(self, power_W: float) -> float:
-        """Full width at half maximum of the focal spot [mm]."""
+        """Compute the full width at half maximum of the focal spot [mm]."""
         return max(self.smallest_spot_mm, self.spot_mm_per_W * power_W)
 
     def figures(self) -> dict[str, float]:
-        """By name, for data sets; equal filters are one."""
+        """List its figures by name, for data sets; equal filters are one."""
         layers: dict[str, float] = {}
         for one in self.filters:
             name = f"{_FILTER}{one.substance.name}_mm"
@@ -74,7 +74,7 @@ class TubeModel:
 
     @classmethod
     def of_figures(cls, figures: Mapping[str, float]) -> TubeModel:
-        """The tube that `figures` describe; the default tube where they do not."""
+        """Make the tube that `figures` describe; the default tube if they do not."""
         if "tube_smallest_spot_mm" not in figures:
             return cls()
         layers = {
@@ -91,7 +91,7 @@ class TubeModel:
 
 
 def tube_of(spec: TubeSpec) -> TubeModel:
-    """The tube of a machine file."""
+    """Make the tube of a machine file."""
     return TubeModel(
         tuple(Filter(Substance.called(f.material), f.thickness_mm) for f in spec.filters),
         spec.spot_mm_per_W,
@@ -126,7 +126,7 @@ class Spectrum:
         return float(self.fluence @ self.energy_keV / self.fluence.sum())
 
     def behind(self, *filters: Filter) -> Spectrum:
-        """The spectrum behind filters."""
+        """Attenuate the spectrum by filters."""
         depth = np.zeros_like(self.fluence)
         for one in filters:
             depth += one.substance.attenuation() * one.thickness_mm
@@ -134,13 +134,13 @@ class Spectrum:
 
 
 def voltages() -> tuple[float, float]:
-    """Least and greatest voltage that there are spectra for [kV]."""
+    """Return the least and greatest voltage with a spectrum [kV]."""
     stored = tables()
     return float(stored.kV[0]), float(stored.kV[-1])
 
 
 def tube_spectrum(kV: float, tube: TubeModel | None = None) -> Spectrum:
-    """What leaves the tube at `kV`, behind its filters.
+    """Compute the spectrum that leaves the tube at `kV`, behind its filters.
 
     Raises:
         LimitError: the tables do not reach, or nothing comes through the filters.
@@ -154,7 +154,7 @@ def tube_spectrum(kV: float, tube: TubeModel | None = None) -> Spectrum:
     bare = (1.0 - part) * stored.fluence[before] + part * stored.fluence[after]
     layers = (TubeModel() if tube is None else tube).filters
     behind = Spectrum(bare).behind(*layers)
-    if not behind.photons > NOTHING:
+    if not behind.photons > MIN_PHOTONS:
         names = ", ".join(f"{one.thickness_mm:g} mm of {one.substance.name}" for one in layers)
         said = f"at {kV:g} kV nothing comes through the tube's filters ({names})"
         raise LimitError.instead(said, kV, "thinner filters or a higher voltage")
@@ -162,7 +162,7 @@ def tube_spectrum(kV: float, tube: TubeModel | None = None) -> Spectrum:
 
 
 def monochromatic(energy_keV: float) -> Spectrum:
-    """All photons in the bin that holds `energy_keV`.
+    """Make a spectrum with all photons in the bin that holds `energy_keV`.
 
     Raises:
         LimitError: outside the tables.
@@ -219,7 +219,7 @@ class Tube:
             object.__setattr__(self, "filters", tuple(map(_filter, self.filters)))
 
     def model(self, design: TubeModel | None = None) -> TubeModel:
-        """Filters and focal spot; those of `design` where this tube states none.
+        """Return filters and focal spot; those of `design` where this tube states none.
 
         Example:
             >>> Tube(filters=(), spot_mm=0.02).model().smallest_spot_mm
@@ -232,7 +232,7 @@ class Tube:
         return TubeModel(layers, 0.0, self.spot_mm)
 
     def exposure(self, exposure_ms: float, averages: int = 1) -> ExposureSettings:
-        """This tube during one image.
+        """Make the exposure settings of this tube during one image.
 
         Example:
             >>> Tube(kV=60, power_W=30).exposure(100.0, averages=4)
@@ -244,6 +244,7 @@ class Tube:
 
 
 def _filter(layer: tuple[str, float] | Filter) -> Filter:
+    """Convert (material, thickness [mm]) to a filter, and check its thickness."""
     if not isinstance(layer, Filter):
         layer = Filter(Substance.called(layer[0]), float(layer[1]))
     name = f"Tube: filter {layer.substance.name}"

@@ -387,10 +387,10 @@ def snap(
 
 def warn_of_exposure(flags: ImageFlags) -> None:
     """Say which part of an image's pixels is saturated or starved, where it is worth saying."""
-    from flexdt.twin.physics.exposure import NOTICED
+    from flexdt.twin.physics.exposure import WARNING_SHARE
 
     for name, share in (("saturated", flags.saturated), ("starved", flags.starved)):
-        if share >= NOTICED:
+        if share >= WARNING_SHARE:
             note(f"warning: {100 * share:.3g} % of the pixels are {name}")
 
 

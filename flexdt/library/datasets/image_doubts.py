@@ -11,7 +11,7 @@ import numpy as np
 from flexdt.library.datasets.image_set import Counts, ImageSet, flats_of
 from flexdt.runtime.files.dataset_folder import read_image
 from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetFormatError
-from flexdt.twin.physics.exposure import FEW_COUNTS, NOTICED
+from flexdt.twin.physics.exposure import FEW_COUNTS, WARNING_SHARE
 from flexdt.twin.plausibility import settled
 from flexdt.twin.plausibility.reference_images import beam_findings, flat_findings, open_beam
 
@@ -55,7 +55,7 @@ def first_look(paths: Mapping[str, Path], full_scale: int | None) -> list[str]:
             share = float((read_image(path) >= full_scale).mean())
         except (OSError, DatasetError):
             continue
-        if share >= NOTICED:
+        if share >= WARNING_SHARE:
             return [saturated_part(what, share)]
     return []
 
@@ -111,9 +111,11 @@ def image_doubts(
             RADIOGRAPHS: float(saturated),
             FLAT_IMAGE: float((flat[alive] >= top).mean()),
         }
-        held = min(shares.values()) <= 1.0 - NOTICED
-        doubts = [saturated_part(what, share) for what, share in shares.items() if share >= NOTICED]
-        if starved >= NOTICED:
+        held = min(shares.values()) <= 1.0 - WARNING_SHARE
+        doubts = [
+            saturated_part(what, share) for what, share in shares.items() if share >= WARNING_SHARE
+        ]
+        if starved >= WARNING_SHARE:
             doubts.append(
                 f"{100.0 * starved:.3g} % of the pixels of the radiographs are starved (fewer "
                 f"than {FEW_COUNTS:g} counts of signal), where attenuation is mostly noise: raise "

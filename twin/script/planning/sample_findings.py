@@ -17,7 +17,7 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.physics.chain import Chain
-from flexdt.twin.physics.exposure import NOTICED, ExposureSettings
+from flexdt.twin.physics.exposure import WARNING_SHARE, ExposureSettings
 from flexdt.twin.physics.predicted_beam import (
     CountShares,
     Physics,
@@ -166,5 +166,5 @@ def _sentences(seen: CountShares | None) -> list[tuple[str, str]]:
     return [
         (name, f"about {100 * share:.3g} % of the projections' pixels will be {name}")
         for name, share in shares
-        if share >= NOTICED
+        if share >= WARNING_SHARE
     ]
