@@ -32,17 +32,18 @@ CUBOIDS_MM: Final[Mapping[str, Vector]] = {
 """Table 6.2 of the thesis: width, breadth, height [mm]."""
 
 DEFAULT_BEADS: Final = 5
-"""The number of beads the thesis recommends (chapter 7)."""
+"""Number of beads that the thesis recommends (chapter 7)."""
 
 MAX_BEADS: Final = 10_000
+"""Largest number of beads of a phantom."""
 
 
 def spiral_positions(size_mm: Sequence[float], beads: int, radius_mm: float) -> FloatArray:
-    """Bead centres on the elliptic spiral that fits a cuboid.
+    """Compute bead centres on the elliptic spiral that fits a cuboid.
 
     Unity's y_k = (k/(K-1) - 1/2)(H - 2r) at angle 2 pi k / K on semi-axes W/2 - r (x) and
-    B/2 - r (z); a single bead sits at mid-height, angle 0 (the thesis describes the spiral but not
-    its formula: assumed).
+    B/2 - r (z); a single bead sits at mid-height, angle 0 (the thesis describes the
+    spiral but not its formula: assumed).
 
     Args:
         size_mm: width (x), breadth (y), height (z) [mm].
@@ -82,10 +83,12 @@ def spiral_positions(size_mm: Sequence[float], beads: int, radius_mm: float) -> 
 
 
 def loop_positions(size_mm: Sequence[float], beads: int, inset_mm: float) -> FloatArray:
-    """Bead centres on one turn of a rectangular loop inside a cuboid, equally spaced in height.
+    """Compute bead centres on one turn of a rectangular loop inside a cuboid, equally
+    spaced in height.
 
-    The layout of the thesis's public code: from (x max, y min) along y min, x min, y max and x max,
-    the last bead above the first. Where the height leaves no room, all stand at mid-height.
+    The layout of the thesis's public code: from (x max, y min) along y min, x min, y max
+    and x max, the last bead above the first. Where the height leaves no room, all stand
+    at mid-height.
 
     Args:
         size_mm: width (x), breadth (y), height (z) [mm].
@@ -121,11 +124,11 @@ def bead_phantom(
     body_material: str = "abs",
     bead_material: str = "steel",
 ) -> Phantom:
-    """A cuboid with `beads` beads on the spiral, or beads in air at given positions.
+    """Make a cuboid with `beads` beads on the spiral, or beads in air at given positions.
 
     Args:
-        name_or_dims: a name of Table 6.2, (width, breadth, height) [mm], or the beads' centres
-            (k, 3) [mm], in the object's frame.
+        name_or_dims: a name of Table 6.2, (width, breadth, height) [mm], or the beads'
+            centres (k, 3) [mm], in the object's frame.
         beads: K; not used with positions.
         bead_radius_mm: 2 mm in the thesis's simulations.
         body_material: of the cuboid (assumed: the thesis does not say).
@@ -197,7 +200,7 @@ def cuboid_with_beads(
     description: str,
     assumed: tuple[str, ...] = (),
 ) -> Phantom:
-    """A cuboid about the origin (or nothing) with beads anywhere inside it.
+    """Make a cuboid about the origin (or nothing) with beads anywhere inside it.
 
     Args:
         name: the phantom's name.
@@ -229,10 +232,11 @@ def cuboid_with_beads(
 
 
 def chiral_phantom() -> Phantom:
-    """Four unequal beads at unequal distances along +x, +y, +z and -x: no mirror image fits.
+    """Make four unequal beads at unequal distances along +x, +y, +z and -x: no mirror
+    image fits.
 
-    For tests of signs and handedness: the largest bead lies along +x, the middle one along +y,
-    the small one along +z, the smallest along -x and lower.
+    For tests of signs and handedness: the largest bead lies along +x, the middle one
+    along +y, the small one along +z, the smallest along -x and lower.
 
     Example:
         >>> chiral_phantom().beads.shape
@@ -252,6 +256,7 @@ def chiral_phantom() -> Phantom:
 
 
 def _check_inside(centers: FloatArray, radii: FloatArray, size_mm: Vector) -> None:
+    """Check that every bead is inside the body; raise LimitError otherwise."""
     room = np.asarray(size_mm) / 2.0 - np.abs(centers) - radii[:, None]
     if (room < -1e-9).any():
         i, axis = (int(v) for v in np.argwhere(room < -1e-9)[0])
@@ -264,7 +269,7 @@ def _check_inside(centers: FloatArray, radii: FloatArray, size_mm: Vector) -> No
 
 
 def worst_overlap(centers: FloatArray, radii: FloatArray) -> tuple[int, int, float] | None:
-    """The two beads that overlap most and by how much [mm], or None."""
+    """Find the two beads that overlap most and by how much [mm], or None."""
     worst: tuple[int, int, float] | None = None
     for i in range(len(centers) - 1):
         gap = np.linalg.norm(centers[i + 1 :] - centers[i], axis=1) - radii[i + 1 :] - radii[i]

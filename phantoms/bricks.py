@@ -25,7 +25,8 @@ from flexdt.twin.projection import analytic_solids as analytic
 
 
 def lego_phantom() -> Phantom:
-    """The LEGO phantom: 24 x 16 x 49.8 mm about the origin, its lowest face at z = -24.9 mm.
+    """Make the LEGO phantom: 24 x 16 x 49.8 mm about the origin, its lowest face at z =
+    -24.9 mm.
 
     >>> len(lego_phantom().beads)
     5
@@ -49,13 +50,14 @@ def lego_phantom() -> Phantom:
 
 
 def lego_data() -> dict[str, Any]:
-    """`data/lego.toml` as it stands: thesis, literature and assumed values apart."""
+    """Read `data/lego.toml`: thesis, literature and assumed values apart."""
     return tomllib.loads(
         (resources.files("flexdt.phantoms") / "data" / "lego.toml").read_text("utf-8")
     )
 
 
 def _bead_positions(stack: Brickwork, radius: float) -> FloatArray:
+    """Compute the bead centres of the LEGO phantom (k, 3) [mm]."""
     v, k = stack.measures, np.arange(stack.bricks)
     width, breadth, height = stack.size_mm
     inset = v["wall_mm"] + v["bead_clearance_mm"] + radius
@@ -69,10 +71,18 @@ def _bead_positions(stack: Brickwork, radius: float) -> FloatArray:
 def brick_shapes(
     v: dict[str, float], studs: tuple[int, int], floor: float, turn: float
 ) -> list[tuple[analytic.Shape, float]]:
-    """Shapes of one brick with +1 (filled) or -1 (hole), turned by `turn` about the axis."""
+    """List the shapes of one brick with +1 (filled) or -1 (hole), turned about the axis.
+
+    Args:
+        v: the brick's measures [mm].
+        studs: along x and y.
+        floor: height of the brick's lower edge [mm].
+        turn: about the axis [rad].
+    """
     rotation = stage_rotation(turn)
 
     def at(x: float, y: float, z: float) -> analytic.Vector:
+        """Turn a place of the brick, [mm]."""
         px, py, pz = (rotation @ np.array([x, y, 0.0]) + [0.0, 0.0, z]).tolist()
         return (px, py, pz)
 
@@ -118,14 +128,14 @@ class Brickwork:
 
     @cached_property
     def measures(self) -> dict[str, float]:
-        """The brick's measures from literature and assumption [mm, deg, turns]."""
+        """Measures of the brick from literature and assumption [mm, deg, turns]."""
         data = lego_data()
         given = {**data["literature"], **data["assumed"]}
         return {key: value for key, value in given.items() if not isinstance(value, str)}
 
     @property
     def size_mm(self) -> analytic.Vector:
-        """Width, breadth, height with the top studs."""
+        """Width, breadth, height with the top studs [mm]."""
         v = self.measures
         return (
             self.studs[0] * v["stud_pitch_mm"],
@@ -134,13 +144,14 @@ class Brickwork:
         )
 
     def floor(self, brick: int) -> float:
-        """Height of a brick's lower edge in the object's frame [mm]."""
+        """Compute the height of a brick's lower edge in the object's frame [mm]."""
         return -self.size_mm[2] / 2.0 + brick * self.measures["brick_height_mm"]
 
     def scene(
         self, beads: FloatArray, radius_mm: float, metal: Material, turn_deg: float = 0.0
     ) -> analytic.Scene:
-        """The bricks, each turned by `turn_deg` against the one below, and beads (k, 3) [mm]."""
+        """Make the scene of the bricks, each turned by `turn_deg` against the one below,
+        and beads (k, 3) [mm]."""
         plastic = material(lego_data()["assumed"]["material"])
         solids = [
             analytic.Solid(shape, plastic.name, sign * plastic.mu_per_mm)

@@ -33,10 +33,10 @@ from flexdt.twin.physics.tube import TubeModel
 from flexdt.twin.projection import Body, TriangleMesh, Volume, project_body
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Vector
 
-SAME = 1e-6
-"""Relative difference of attenuations that count as equal."""
+ATTENUATION_TOLERANCE = 1e-6
+"""Largest relative difference of attenuations that count as equal."""
 STAND_IN = "water"
-"""For what has an attenuation but no composition."""
+"""Material assumed for what has an attenuation but no composition."""
 SUB_COLUMNS = 8
 """Samples of solids and meshes along x and y in each voxel; along z their ends are exact."""
 
@@ -60,7 +60,8 @@ class Channel:
 
 
 def channels(phantom: Phantom) -> tuple[Channel, ...]:
-    """The phantom's materials and where they are; empty for a phantom of nothing."""
+    """Divide a phantom into its materials and where they are; empty for a phantom of
+    nothing."""
     amounts: dict[str, list[Solid]] = {}
     stand_ins: set[str] = set()
     names = dict.fromkeys(solid.material for solid in phantom.scene.solids)
@@ -100,7 +101,15 @@ def channels(phantom: Phantom) -> tuple[Channel, ...]:
 def chain_through(
     parts: Sequence[Channel], panel: Detector, tube: TubeModel, mono_keV: float | None = None
 ) -> Chain:
-    """The chain from the paths through these materials to counts, see `flexdt.twin.physics`."""
+    """Make the chain from the paths through these materials to counts, see
+    `flexdt.twin.physics`.
+
+    Args:
+        parts: from `channels`.
+        panel: the detector.
+        tube: the source.
+        mono_keV: energy of all photons [keV]; None for the whole spectrum.
+    """
     return Chain(
         panel,
         tube,
@@ -111,7 +120,8 @@ def chain_through(
 
 
 def attenuating(phantom: Phantom) -> tuple[tuple[Body, float], ...]:
-    """Bodies and factors: their projections times these add up to the phantom's line integrals."""
+    """List bodies and factors: their projections times these add up to the phantom's line
+    integrals."""
     out: list[tuple[Body, float]] = []
     if phantom.scene.solids:
         out.append((phantom.scene, 1.0))
@@ -128,7 +138,7 @@ def attenuating(phantom: Phantom) -> tuple[tuple[Body, float], ...]:
 
 
 def line_integrals(phantom: Phantom, cone_vec: ConeVec, shape: tuple[int, int]) -> Float32Array:
-    """Attenuation along every ray at the energy at which phantoms state it.
+    """Compute the attenuation along every ray at the energy at which phantoms state it.
 
     Args:
         phantom: solids and closed meshes are exact, ready voxels as they are.
@@ -152,7 +162,7 @@ def line_integrals(phantom: Phantom, cone_vec: ConeVec, shape: tuple[int, int]) 
 
 
 def _exact(surface: Surface) -> TriangleMesh | None:
-    """The surface as a mesh with exact paths, in which bodies that overlap are one.
+    """Convert the surface to a mesh with exact paths, in which bodies that overlap are united.
 
     None where its triangles do not share their corners, or where it meets itself.
     """
@@ -163,14 +173,20 @@ def _exact(surface: Surface) -> TriangleMesh | None:
 
 
 def _mesh(phantom: Phantom, surface: Surface, made_of: Material) -> Body:
+    """Convert a surface to a mesh, or to voxels where the mesh is not exact or of another
+    density."""
     mesh = _exact(surface)
-    if mesh is not None and abs(surface.mu_per_mm / made_of.mu_per_mm - 1.0) <= SAME:
+    if (
+        mesh is not None
+        and abs(surface.mu_per_mm / made_of.mu_per_mm - 1.0) <= ATTENUATION_TOLERANCE
+    ):
         return mesh
     grid = voxelise(Scene(()), (surface,), phantom.size_mm, phantom.default_voxel_mm, 2)
     return _scaled(grid, made_of)
 
 
 def _find(name: str) -> Material | None:
+    """Look up a material; None if it is unknown."""
     try:
         return material(name)
     except UnknownNameError:
@@ -178,26 +194,30 @@ def _find(name: str) -> Material | None:
 
 
 def _amounts(solid: Solid, known: dict[str, Material]) -> list[tuple[str, float]]:
-    """Material -> amount of it (1: its own density) that a solid adds."""
+    """List (material, amount) that a solid adds, 1 for the material's own density."""
     own = known.get(solid.material)
     if own is None:
         return [(STAND_IN, solid.mu_per_mm / materials()[STAND_IN].mu_per_mm)]
     amount = solid.mu_per_mm / own.mu_per_mm
-    if abs(abs(amount) - 1.0) <= SAME:
+    if abs(abs(amount) - 1.0) <= ATTENUATION_TOLERANCE:
         return [(own.name, round(amount))]
     for other in known.values():
         difference = own.mu_per_mm - other.mu_per_mm
-        if other is not own and abs(solid.mu_per_mm - difference) <= SAME * own.mu_per_mm:
+        if (
+            other is not own
+            and abs(solid.mu_per_mm - difference) <= ATTENUATION_TOLERANCE * own.mu_per_mm
+        ):
             return [(own.name, 1.0), (other.name, -1.0)]
     return [(own.name, amount)]
 
 
 def _scaled(volume: Volume, made_of: Material) -> Volume:
+    """Convert a volume of attenuation to amounts of a material."""
     return volume.like(volume.data / np.float32(made_of.mu_per_mm))
 
 
 def scatter_object(parts: Sequence[Channel], size_mm: Vector, voxels: int) -> Object:
-    """The materials of a phantom on one grid about the origin.
+    """Sample the materials of a phantom on one grid about the origin.
 
     Args:
         parts: from `channels`.
@@ -230,6 +250,7 @@ def scatter_object(parts: Sequence[Channel], size_mm: Vector, voxels: int) -> Ob
 
 
 def _fractions_filled(body: Body, grid: Volume, box: Vector) -> Float32Array:
+    """Sample a body on a coarse grid: the part of each voxel that it fills."""
     edge = grid.voxel_xyz[0]
     if isinstance(body, Scene):
         return voxelise(body, (), box, edge, SUB_COLUMNS).data
@@ -244,9 +265,10 @@ def _fractions_filled(body: Body, grid: Volume, box: Vector) -> Float32Array:
 
 
 def _overlaps(fine: Volume, coarse: Volume, axis: int) -> FloatArray:
-    """Length of each coarse voxel in each fine one over its own, (coarse, fine)."""
+    """Compute the length of each coarse voxel in each fine one over its own, (coarse, fine)."""
 
     def planes(volume: Volume) -> FloatArray:
+        """Compute the planes between the voxels of a volume [mm]."""
         n, edge = volume.data.shape[2 - axis], volume.voxel_xyz[axis]
         return np.asarray((np.arange(n + 1) - n / 2.0) * edge + volume.center_mm[axis])
 

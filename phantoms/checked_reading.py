@@ -26,14 +26,14 @@ from flexdt.twin.projection import analytic_solids as analytic
 
 MAX_ARRAY_BYTES: Final = 4 << 30
 MAX_TEXT: Final = 4096
-LARGEST: Final = 1e9
-SMALLEST: Final = 1e-9
-"""Of lengths [mm]."""
+MAX_NUMBER: Final = 1e9
+MIN_LENGTH_MM: Final = 1e-9
+"""Smallest length [mm]."""
 _T = TypeVar("_T")
 Reader = Callable[[object, str], Any]
-NONE: Final[Mapping[str, Reader]] = {}
-IT: Final = "it"
-"""The key path of a field that pydantic has named already."""
+NO_READERS: Final[Mapping[str, Reader]] = {}
+NAMED_ALREADY: Final = "it"
+"""Key path of a field that pydantic has named already."""
 MAX_SOLIDS: Final = 100_000
 _KINDS: Final[Mapping[str, type[analytic.Shape]]] = {
     "sphere": analytic.Sphere,
@@ -43,7 +43,7 @@ _KINDS: Final[Mapping[str, type[analytic.Shape]]] = {
     "convex": analytic.ConvexPolyhedron,
 }
 _KIND_OF: Final[Mapping[type[analytic.Shape], str]] = {cls: kind for kind, cls in _KINDS.items()}
-_OPTIONAL: Final = ("axis", "axes")
+_OPTIONAL_FIELDS: Final = ("axis", "axes")
 
 
 class PhantomError(TwinError):
@@ -51,21 +51,21 @@ class PhantomError(TwinError):
 
 
 def wrong(value: object, where: str, allowed: str) -> PhantomError:
-    """The error for a value that is not what is `allowed` at key path `where`."""
+    """Make the error for a value that is not what is `allowed` at key path `where`."""
     shown = repr(value)
     shown = shown if len(shown) <= 80 else shown[:77] + "..."
     return PhantomError.instead(f"{where} is {shown}", shown, allowed, path=where)
 
 
 def mapping(value: object, where: str) -> Mapping[str, object]:
-    """`value` as an object with named fields."""
+    """Check that `value` is an object with named fields."""
     if not isinstance(value, Mapping):
         raise wrong(value, where, "an object")
     return value
 
 
 def get(document: object, key: str, where: str) -> object:
-    """Field `key` of `document`, which must have it."""
+    """Return field `key` of `document`, which must have it."""
     given = mapping(document, where)
     if key not in given:
         raise PhantomError(f"{where}.{key} is missing", {"path": f"{where}.{key}"})
@@ -73,10 +73,22 @@ def get(document: object, key: str, where: str) -> object:
 
 
 def fields(
-    value: object, where: str, needed: Mapping[str, Reader], others: Mapping[str, Reader] = NONE
+    value: object,
+    where: str,
+    needed: Mapping[str, Reader],
+    others: Mapping[str, Reader] = NO_READERS,
 ) -> dict[str, Any]:
-    """The fields of an object as their readers have them: all that are needed, and of the others
-    those that are there. One that nobody reads is an error."""
+    """Read the fields of an object; a key without a reader is an error.
+
+    Args:
+        value: the object.
+        where: its key path.
+        needed: name -> reader of a field that must be there.
+        others: name -> reader of a field that may be left out.
+
+    Returns:
+        Name -> what its reader returned.
+    """
     readers = {**needed, **others}
     for key in mapping(value, where):
         if key not in readers:
@@ -87,46 +99,50 @@ def fields(
 
 
 def string(value: object, where: str) -> str:
-    """`value` as a text of bounded length."""
+    """Check that `value` is a text of bounded length."""
     if not isinstance(value, str) or len(value) > MAX_TEXT:
         raise wrong(value, where, f"a text of at most {MAX_TEXT} characters")
     return value
 
 
 def number(value: object, where: str) -> float:
-    """`value` as a number within what the arithmetic behind bears."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
-        raise wrong(value, where, f"a number from {-LARGEST:g} to {LARGEST:g}")
+    """Check that `value` is a number within what later arithmetic can take."""
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, int | float)
+        or not abs(value) <= MAX_NUMBER
+    ):
+        raise wrong(value, where, f"a number from {-MAX_NUMBER:g} to {MAX_NUMBER:g}")
     return float(value)
 
 
 def positive(value: object, where: str) -> float:
-    """`value` as a length above 0."""
+    """Check that `value` is a length above 0."""
     found = number(value, where)
-    if found < SMALLEST:
-        raise wrong(value, where, f"a number from {SMALLEST:g} to {LARGEST:g}")
+    if found < MIN_LENGTH_MM:
+        raise wrong(value, where, f"a number from {MIN_LENGTH_MM:g} to {MAX_NUMBER:g}")
     return found
 
 
 def each(value: object, where: str, read: Callable[[object, str], _T]) -> tuple[_T, ...]:
-    """`value` as a list of what `read` reads."""
+    """Read a list, each item by `read`."""
     if not isinstance(value, list | tuple):
         raise wrong(value, where, "a list")
     return tuple(read(item, f"{where}[{i}]") for i, item in enumerate(value))
 
 
 def vector(value: object, where: str) -> analytic.Vector:
-    """`value` as three finite numbers."""
+    """Check that `value` is three finite numbers."""
     return _three(value, where, number)
 
 
 def lengths(value: object, where: str) -> analytic.Vector:
-    """`value` as three numbers above 0."""
+    """Check that `value` is three numbers above 0."""
     return _three(value, where, positive)
 
 
 def unit(value: object, where: str) -> analytic.Vector:
-    """`value` as a unit vector."""
+    """Check that `value` is a unit vector."""
     found = vector(value, where)
     if abs(math.hypot(*found) - 1.0) > 1e-6:
         raise wrong(value, where, "a unit vector")
@@ -134,31 +150,32 @@ def unit(value: object, where: str) -> analytic.Vector:
 
 
 def axes(value: object, where: str) -> analytic.Matrix:
-    """`value` as three orthogonal unit vectors."""
+    """Check that `value` is three orthogonal unit vectors."""
     rows = each(value, where, unit)
     if len(rows) != 3 or not np.allclose(np.array(rows) @ np.array(rows).T, np.eye(3), atol=1e-6):
         raise wrong(value, where, "three orthogonal unit vectors")
     return (rows[0], rows[1], rows[2])
 
 
-Text = Annotated[str, BeforeValidator(partial(string, where=IT))]
-Number = Annotated[float, BeforeValidator(partial(number, where=IT))]
-Place = Annotated[analytic.Vector, BeforeValidator(partial(vector, where=IT))]
-Lengths = Annotated[analytic.Vector, BeforeValidator(partial(lengths, where=IT))]
+Text = Annotated[str, BeforeValidator(partial(string, where=NAMED_ALREADY))]
+Number = Annotated[float, BeforeValidator(partial(number, where=NAMED_ALREADY))]
+Place = Annotated[analytic.Vector, BeforeValidator(partial(vector, where=NAMED_ALREADY))]
+Lengths = Annotated[analytic.Vector, BeforeValidator(partial(lengths, where=NAMED_ALREADY))]
 
 
 def packed(dtype: str) -> PlainValidator:
-    """How pydantic reads an array of `dtype` that `PACK` wrote; nothing is executed."""
+    """Make the validator of an array of `dtype` that `PACK` wrote; nothing is executed."""
 
     def read(value: object) -> npt.NDArray[np.generic]:
-        if get(value, "dtype", IT) != dtype:
-            raise wrong(get(value, "dtype", IT), "dtype", dtype)
-        shape = each(get(value, "shape", IT), "shape", _count)
+        """Decode {dtype, shape, data}; check type, size and base64."""
+        if get(value, "dtype", NAMED_ALREADY) != dtype:
+            raise wrong(get(value, "dtype", NAMED_ALREADY), "dtype", dtype)
+        shape = each(get(value, "shape", NAMED_ALREADY), "shape", _count)
         size = math.prod(shape) * np.dtype(dtype).itemsize
         if size > MAX_ARRAY_BYTES:
             raise wrong(shape, "shape", f"at most {MAX_ARRAY_BYTES} bytes")
         try:
-            raw = base64.b64decode(str(get(value, "data", IT)), validate=True)
+            raw = base64.b64decode(str(get(value, "data", NAMED_ALREADY)), validate=True)
         except ValueError as error:
             raise PhantomError(f"data is not base64: {error}") from None
         if len(raw) != size:
@@ -169,22 +186,25 @@ def packed(dtype: str) -> PlainValidator:
 
 
 def _pack(array: npt.NDArray[np.generic]) -> dict[str, object]:
+    """Encode an array as {dtype, shape, data}."""
     little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
     data = base64.b64encode(little.tobytes()).decode("ascii")
     return {"dtype": little.dtype.str, "shape": list(array.shape), "data": data}
 
 
 PACK: Final = PlainSerializer(_pack, when_used="json")
-"""An array as `{dtype, shape, data}`, base64 in C order, little-endian."""
+"""Serialises an array as `{dtype, shape, data}`, base64 in C order, little-endian."""
 
 
 def _count(value: object, where: str) -> int:
+    """Check that `value` is a whole number from 0."""
     if isinstance(value, bool) or not isinstance(value, int) or value < 0:
         raise wrong(value, where, "a whole number from 0")
     return value
 
 
 def _three(value: object, where: str, read: Callable[[object, str], float]) -> analytic.Vector:
+    """Read three numbers, each by `read`."""
     numbers = each(value, where, read)
     if len(numbers) != 3:
         raise wrong(value, where, "three numbers")
@@ -202,11 +222,12 @@ _READERS: Final[Mapping[str, Reader]] = {
     "normals": lambda value, where: each(value, where, unit),
     "offsets": lambda value, where: each(value, where, number),
 }
-"""How each field of a shape is read."""
+"""Reader of each field of a shape."""
 
 
 def scene_to_dict(scene: analytic.Scene) -> dict[str, object]:
-    """JSON-able document of a scene: `{solids: [{shape: {kind, ...}, material, mu_per_mm}]}`.
+    """Convert a scene to a JSON-able document: `{solids: [{shape: {kind, ...}, material,
+    mu_per_mm}]}`.
 
     Example:
         >>> from flexdt.phantoms import load_phantom
@@ -230,7 +251,7 @@ def scene_to_dict(scene: analytic.Scene) -> dict[str, object]:
 
 
 def scene_from_dict(document: object, where: str = "scene") -> analytic.Scene:
-    """The scene of a document that `scene_to_dict` made.
+    """Make a scene from a document of `scene_to_dict`.
 
     Raises:
         PhantomError: names the key path, the value and what is allowed.
@@ -248,6 +269,7 @@ def scene_from_dict(document: object, where: str = "scene") -> analytic.Scene:
 
 
 def _solid(document: object, where: str) -> analytic.Solid:
+    """Read a solid."""
     return analytic.Solid(
         shape_from_dict(get(document, "shape", where), f"{where}.shape"),
         string(get(document, "material", where), f"{where}.material"),
@@ -256,12 +278,12 @@ def _solid(document: object, where: str) -> analytic.Solid:
 
 
 def shape_from_dict(document: object, where: str) -> analytic.Shape:
-    """The shape of `{kind, ...}`; raises PhantomError naming the key path."""
+    """Make a shape from `{kind, ...}`; raise PhantomError naming the key path."""
     kind = get(document, "kind", where)
     if not isinstance(kind, str) or kind not in _KINDS:
         raise wrong(kind, f"{where}.kind", ", ".join(_KINDS))
     names = [f.name for f in fields_of(_KINDS[kind])]
     given = {key: one for key, one in mapping(document, where).items() if key != "kind"}
-    needed = {name: _READERS[name] for name in names if name not in _OPTIONAL}
-    others = {name: _READERS[name] for name in names if name in _OPTIONAL}
+    needed = {name: _READERS[name] for name in names if name not in _OPTIONAL_FIELDS}
+    others = {name: _READERS[name] for name in names if name in _OPTIONAL_FIELDS}
     return _KINDS[kind](**fields(given, where, needed, others))

@@ -50,21 +50,22 @@ from flexdt.twin.script.problems import ScriptProblem
 from flexdt.twin.script.scan_request import Kind, ScanRequest
 from flexdt.twin.signatures import public
 
-VIEWS: Final = 8
-"""Views of a turn that a forecast looks at."""
-EDGES: Final = np.concatenate([[0.0], np.logspace(-3.95, 0.05, 41), [np.inf]])
-"""Bins of transmission: ten a decade, the open beam amid the last, and what lies outside."""
+SIMULATED_VIEWS: Final = 8
+"""Number of views of a turn that are simulated."""
+TRANSMISSION_EDGES: Final = np.concatenate([[0.0], np.logspace(-3.95, 0.05, 41), [np.inf]])
+"""Edges of the bins of transmission: ten a decade, the open beam amid the last, and the
+rest."""
 FILTERS: Final = (
     "", "aluminium:0.5", "aluminium:1", "aluminium:2", "copper:0.1", "copper:0.25", "copper:0.5",
     "copper:1",
 )  # fmt: skip
-"""Proposed filters, beside what the tube has."""
+"""Filters that are proposed, beside what the tube has."""
 VOID: Final = "void"
 
 
 @dataclass(frozen=True)
 class Transmission:
-    """How much of the open beam the pixels see.
+    """Distribution of the pixels' part of the open beam.
 
     Attributes:
         least, p1, p5, median: smallest value and quantiles.
@@ -81,23 +82,25 @@ class Transmission:
 
     @classmethod
     def of(cls, values: npt.NDArray[Any]) -> Transmission:
-        """Of the pixels of images."""
+        """Compute it from the pixels of images."""
         flat = np.asarray(values, dtype=np.float64).ravel()
-        counts, _ = np.histogram(np.maximum(flat, 0.0), EDGES)
+        counts, _ = np.histogram(np.maximum(flat, 0.0), TRANSMISSION_EDGES)
         p1, p5, median = np.quantile(flat, (0.01, 0.05, 0.5)).tolist()
         shares = (counts / flat.size).tolist()
-        return cls(float(flat.min()), p1, p5, median, tuple(EDGES.tolist()), tuple(shares))
+        return cls(
+            float(flat.min()), p1, p5, median, tuple(TRANSMISSION_EDGES.tolist()), tuple(shares)
+        )
 
 
 @dataclass(frozen=True)
 class Setting:
-    """Tube and camera, and what they give on the darkest ray.
+    """A setting of tube and camera, and its contrast and dose on the darkest ray.
 
     Attributes:
         kV, filter: voltage, and the filter beside the tube's own ("" for none).
         exposure_ms, averages: of one image; their product is the time asked for.
-        cnr: contrast of the detail to the noise, of one pixel of one image; None where that pixel
-            is saturated.
+        cnr: contrast of the detail to the noise, of one pixel of one image; None where
+            that pixel is saturated.
         kerma_mGy: air kerma of the whole scan on the axis, without a sample.
     """
 
@@ -111,7 +114,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class Forecast:
-    """What a scan will look like.
+    """Forecast of a scan's images.
 
     Attributes:
         transmission: of the views' pixels.
@@ -237,7 +240,11 @@ def expose(
     assert sod is not None
     assert sdd is not None
     cone = ConeVec.circular(
-        sod=sod, sdd=sdd, angles=VIEWS, shape=camera.shape, pixel=camera.pixel_mm(spec.pixels)
+        sod=sod,
+        sdd=sdd,
+        angles=SIMULATED_VIEWS,
+        shape=camera.shape,
+        pixel=camera.pixel_mm(spec.pixels),
     )
     layers = _Layers(parts, scanner, filter)
     paths, through, saturated, starved = _views(parts, layers.chains[filter], camera, cone, lit)
@@ -269,7 +276,7 @@ def expose(
 
 
 def _voltages(machine: Machine) -> tuple[float, float]:
-    """Give the least and the greatest voltage [kV] of the tube that has a spectrum."""
+    """Return the least and the greatest voltage [kV] of the tube that has a spectrum."""
     low, high = voltages()
     return max(machine.tube.min_kV, low), min(machine.tube.max_kV, high)
 
@@ -282,7 +289,7 @@ def _check_settings(
     averages: float,
     images: float,
 ) -> None:
-    """Refuse settings that the machine does not have.
+    """Check that the machine has these settings.
 
     Raises:
         LimitError: names the setting, what was asked and what is allowed.
@@ -315,7 +322,7 @@ def _check_settings(
 def _plan_of(
     request: ScanRequest, machine: Machine, profile: Profile | None, start: StartState | None
 ) -> ScanPlan:
-    """Plan the script that is composed for a request.
+    """Compose a script for a request and plan it.
 
     Raises:
         LimitError: distances or speeds that the machine does not have.
@@ -326,7 +333,7 @@ def _plan_of(
 
 
 def _distances(plan: ScanPlan) -> tuple[float, float]:
-    """Give SOD and SDD [mm] of a plan's first projections."""
+    """Return SOD and SDD [mm] of a plan's first projections."""
     first = next(view for view in views(plan) if view.kind == "projection")
     return float(first.poses.sod[0]), float(first.poses.sdd[0])
 
@@ -361,7 +368,7 @@ class _Layers:
 
 @dataclass(frozen=True)
 class _SeenDetail:
-    """How well a detail on the darkest ray is seen.
+    """Contrast of a detail on the darkest ray.
 
     Attributes:
         layers: the filters.
@@ -379,7 +386,8 @@ class _SeenDetail:
     images: int
 
     def setting(self, layer: str, at: ExposureSettings) -> Setting:
-        """Rate a setting; without contrast where a pixel that it rests on is saturated."""
+        """Compute contrast and dose of a setting; without contrast where a pixel is
+        saturated."""
         chain = self.layers.chains[layer]
         plain, changed = (
             pixel_reading(chain, self.camera, at, one.flux, one.paths_mm, one.added)
@@ -405,7 +413,7 @@ class _SeenDetail:
 
 
 def exposure_problems(plan: ScanPlan, phantom: Phantom) -> tuple[ScriptProblem, ...]:
-    """Warn of projections of a plan whose pixels will be saturated or starved.
+    """Warn of a plan's projections whose pixels will be saturated or starved.
 
     Args:
         plan: of the scan.
@@ -435,7 +443,8 @@ def _views(
     cone: ConeVec,
     lit: ExposureSettings,
 ) -> tuple[Float32Array, npt.NDArray[Any], float, float]:
-    """Paths (k, n, rows, cols), transmission (n, rows, cols), saturated and starved parts."""
+    """Simulate views: paths (k, n, rows, cols), transmission (n, rows, cols), saturated
+    and starved parts."""
     paths = np.stack([project_body(part.body, cone, camera.shape) for part in parts])
     images = radiographs(chain, paths, cone.rows, [lit] * len(cone))
     through = np.exp(-np.stack([image.integrals for image in images]))
@@ -447,7 +456,8 @@ def _views(
 
 @dataclass(frozen=True)
 class _Ray:
-    """A ray through the sample: paths, pixel's share of the beam, that of the brightest pixel."""
+    """A ray through the sample: paths, its pixel's share of the beam, that of the
+    brightest pixel."""
 
     paths_mm: tuple[float, ...]
     flux: float
@@ -457,7 +467,7 @@ class _Ray:
     def with_detail(
         self, detail: tuple[Substance | None, float], substances: Sequence[Substance]
     ) -> _Ray:
-        """The same ray with so much of a substance more, or of what it meets most less."""
+        """Add so much of a substance to the ray, or remove it from what it meets most."""
         substance, thickness = detail
         if substance is not None:
             return replace(self, added=(substance, thickness))
@@ -477,7 +487,7 @@ class _Ray:
 
 
 def _layer(what: str, words: str) -> tuple[str, float]:
-    """The name and the thickness [mm] of MATERIAL:MM."""
+    """Parse MATERIAL:MM to name and thickness [mm]."""
     name, _, size = words.rpartition(":")
     try:
         value = float(size)

@@ -43,7 +43,7 @@ class Material:
 
     @property
     def substance(self) -> Substance:
-        """What it is made of, for attenuation at every energy."""
+        """Its composition, for attenuation at every energy."""
         return Substance(self.name, self.fractions, self.density_g_cm3)
 
     @property
@@ -52,7 +52,8 @@ class Material:
         return self.mu_at(self.effective_energy_keV)
 
     def mu_at(self, energy_keV: float) -> float:
-        """Linear attenuation coefficient at `energy_keV` [1/mm], log-log between the points.
+        """Interpolate the linear attenuation coefficient at `energy_keV` [1/mm], log-log
+        between the points.
 
         Raises:
             LimitError: the energy lies outside the table.
@@ -77,7 +78,7 @@ class Material:
 
 @lru_cache
 def materials() -> Mapping[str, Material]:
-    """All bundled materials by name."""
+    """Load all bundled materials by name."""
     text = (resources.files("flexdt.phantoms") / "data" / "materials.toml").read_text("utf-8")
     document = tomllib.loads(text)
     return {
@@ -95,12 +96,12 @@ def materials() -> Mapping[str, Material]:
 
 
 def stated_keV() -> float:
-    """The energy at which phantoms state their attenuation [keV]."""
+    """Return the energy at which phantoms state their attenuation [keV]."""
     return next(iter(materials().values())).effective_energy_keV
 
 
 def material(name: str) -> Material:
-    """The material called `name`, or written FORMULA@DENSITY [g/cm3].
+    """Look up the material called `name`, or parse FORMULA@DENSITY [g/cm3].
 
     Raises:
         UnknownNameError: lists the materials there are; or an unknown element.
@@ -124,6 +125,7 @@ def material(name: str) -> Material:
 
 @lru_cache(maxsize=64)
 def _by_formula(name: str) -> Material:
+    """Make the material of FORMULA@DENSITY."""
     substance = Substance.parse(name)
     return Material(
         name,
@@ -137,6 +139,7 @@ def _by_formula(name: str) -> Material:
 
 
 def _fractions(entry: Mapping[str, object]) -> tuple[tuple[str, float], ...]:
+    """Read mass fractions, or compute them from a formula."""
     formula, fractions = entry.get("formula"), entry.get("fractions")
     if isinstance(fractions, Mapping):
         return tuple((str(s), float(f)) for s, f in fractions.items())

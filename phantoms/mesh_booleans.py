@@ -25,15 +25,16 @@ if TYPE_CHECKING:
     import manifold3d
 
 
-MOST_BODIES: Final = 2000
-"""Above which boxes are not compared pair by pair."""
+MAX_COMPARED_BODIES: Final = 2000
+"""Largest number of bodies whose boxes are compared pair by pair."""
 
 
 def united(mesh: TriangleMesh) -> TriangleMesh | None:
-    """The mesh with its overlapping bodies made one; itself where the boxes around them are apart.
+    """Unite the overlapping bodies of a mesh; return it unchanged where the boxes around
+    them are apart.
 
-    Shells turned inwards are cavities of the body around them. None where the surface of a body
-    meets itself, so that it has no inside.
+    Shells turned inwards are cavities of the body around them. None where the surface of
+    a body meets itself, so that it has no inside.
     """
     bodies = _bodies(mesh)
     if not _boxes_meet([mesh.vertices[np.unique(mesh.faces[body])] for body in bodies]):
@@ -48,13 +49,14 @@ def united(mesh: TriangleMesh) -> TriangleMesh | None:
 def cut(
     parts: Sequence[tuple[analytic.Scene, Sequence[Surface], float]],
 ) -> tuple[analytic.Scene, tuple[Surface, ...]]:
-    """Solids and surfaces of which each has only what none of a higher priority takes.
+    """Cut solids and surfaces so that each has only what none of a higher priority takes.
 
     Args:
         parts: solids, surfaces and the priority of both.
 
     Raises:
-        PhantomError: something round, a hole, or a mesh that meets itself would have to be cut.
+        PhantomError: something round, a hole, or a mesh that meets itself would have to
+            be cut.
 
     Example:
         >>> import trimesh
@@ -86,13 +88,14 @@ def cut(
 
 
 def _box(one: analytic.Solid | Surface) -> tuple[FloatArray, FloatArray]:
+    """Return the low and high corner of the box around a piece, (3,) each [mm]."""
     if isinstance(one, analytic.Solid):
         return bounds(one.shape)
     return one.vertices.min(axis=0), one.vertices.max(axis=0)
 
 
 def _filled(one: analytic.Solid | Surface) -> Surface:
-    """The piece as a mesh of exactly its form."""
+    """Convert the piece to a mesh of exactly its form."""
     if isinstance(one, Surface):
         return one
     if not isinstance(one.shape, analytic.Box | analytic.ConvexPolyhedron) or one.mu_per_mm < 0.0:
@@ -107,7 +110,7 @@ def _filled(one: analytic.Solid | Surface) -> Surface:
 
 
 def _outside(surface: Surface, others: Sequence[Surface]) -> Surface | None:
-    """What of a filled mesh lies outside the others; None if nothing does."""
+    """Subtract the others from a filled mesh; None if nothing is left."""
     import manifold3d
 
     solids = [
@@ -124,7 +127,7 @@ def _outside(surface: Surface, others: Sequence[Surface]) -> Surface | None:
 
 
 def _bodies(mesh: TriangleMesh) -> list[npt.NDArray[np.int64]]:
-    """Indices of the faces of each connected surface."""
+    """Find the faces of each connected surface."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -138,8 +141,8 @@ def _bodies(mesh: TriangleMesh) -> list[npt.NDArray[np.int64]]:
 
 
 def _boxes_meet(bodies: Sequence[npt.NDArray[np.float64]]) -> bool:
-    """Whether the boxes around any two of the bodies overlap."""
-    if len(bodies) > MOST_BODIES:
+    """Return whether the boxes around any two of the bodies overlap."""
+    if len(bodies) > MAX_COMPARED_BODIES:
         return True
     low = np.array([corners.min(axis=0) for corners in bodies])
     high = np.array([corners.max(axis=0) for corners in bodies])
@@ -148,7 +151,7 @@ def _boxes_meet(bodies: Sequence[npt.NDArray[np.float64]]) -> bool:
 
 
 def _solid(mesh: TriangleMesh, bodies: Sequence[npt.NDArray[np.int64]]) -> manifold3d.Manifold:
-    """The union of the bodies, each without the cavities in it.
+    """Unite the bodies, each without the cavities in it.
 
     Raises:
         PhantomError: the surface of one meets itself.

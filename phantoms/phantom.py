@@ -33,10 +33,10 @@ if TYPE_CHECKING:
     import trimesh
 
 SCHEMA = 1
-"""Version of the document `to_dict` makes."""
+"""Version of the document of `to_dict`."""
 
 VOXELS_ALONG_LONGEST = 256
-"""Resolution of `volume()` when no voxel size is asked for."""
+"""Voxels along the longest side in `volume()` by default."""
 
 
 _Scene = Annotated[
@@ -105,12 +105,12 @@ class Phantom(ArrayValue):
 
     @property
     def default_voxel_mm(self) -> float:
-        """Voxel edge of `volume()` when none is asked for [mm]."""
+        """Voxel edge of `volume()` by default [mm]."""
         return max(self.size_mm) / VOXELS_ALONG_LONGEST
 
     @property
     def bounding_radius_mm(self) -> float:
-        """Radius of the smallest sphere about the origin that is sure to hold it [mm]."""
+        """Radius of a sphere about the origin that contains the phantom [mm]."""
         return float(np.linalg.norm(np.asarray(self.size_mm) / 2.0))
 
     @property
@@ -119,27 +119,27 @@ class Phantom(ArrayValue):
         return np.array(boxes(self.scene, self.surfaces, self.voxels)).reshape(-1, 2, 3)
 
     def parts(self) -> tuple[SurfacePart, ...]:
-        """The scene side piece by piece: one closed mesh for each solid, with its material."""
+        """Make one closed mesh for each piece, with its material."""
         return parts_of(self.scene, self.surfaces, self.voxels, self.beads)
 
     def mesh(self, *, around: bool = False) -> trimesh.Trimesh:
-        """The scene side: all surfaces as one mesh, holes turned inside out [mm, object frame].
+        """Join all surfaces into one mesh, holes turned inside out [mm, object frame].
 
         A bead inside a body appears as a surface of its own inside the body's.
 
         Args:
-            around: for collisions: the polyhedra of round solids hold them, instead of lying
-                inside them.
+            around: for collisions: the polyhedra of round solids hold them, instead of
+                lying inside them.
         """
         pieces = self.scene, self.surfaces, self.voxels
         return joined(parts_of(*pieces, self.beads, around=around))
 
     def volume(self, voxel_mm: float | None = None, *, oversample: int = 2) -> Volume:
-        """The X-ray side as voxels, computed anew at every call.
+        """Convert to voxels for X-rays, at every call.
 
         Args:
-            voxel_mm: voxel edge [mm]; default: 256 voxels along the longest side. A phantom that
-                came as voxels is returned as it came.
+            voxel_mm: voxel edge [mm]; default: 256 voxels along the longest side. A
+                phantom that came as voxels is returned as it came.
             oversample: samples per voxel along each side.
 
         Returns:
@@ -153,7 +153,7 @@ class Phantom(ArrayValue):
         return voxelise(self.scene, self.surfaces, self.size_mm, voxel, oversample)
 
     def to_dict(self) -> dict[str, object]:
-        """JSON-able document; `from_dict` gives an equal phantom."""
+        """Convert to a JSON-able document; `from_dict` makes an equal phantom of it."""
         document = adapter_of(Phantom).dump_python(self, mode="json", exclude_none=True)
         for place, name in ((document, "surfaces"), (document.get("voxels", {}), "materials")):
             if not place.get(name):  # left out where there are none
@@ -162,7 +162,7 @@ class Phantom(ArrayValue):
 
     @classmethod
     def from_dict(cls, document: object) -> Phantom:
-        """The phantom of a document that `to_dict` made.
+        """Make a phantom from a document of `to_dict`.
 
         Raises:
             PhantomError: names the key path, the value and what is allowed.
@@ -182,14 +182,15 @@ class Phantom(ArrayValue):
 def assemble(
     name: str, parts: Sequence[Phantom], description: str = "", priority: Sequence[float] = ()
 ) -> Phantom:
-    """One phantom of several; attenuation adds up where they overlap.
+    """Join several phantoms; attenuation adds up where they overlap.
 
     Args:
         name: of the whole.
         parts: solids and meshes, in one object frame.
         description: one line; default: the parts' names.
-        priority: of each part; where they overlap, the one of the highest is there alone, and
-            equal ones add up. Meshes, boxes and convex solids can be cut. Default: all alike.
+        priority: of each part; where they overlap, the one of the highest is there alone,
+            and equal ones add up. Meshes, boxes and convex solids can be cut. Default:
+            all alike.
 
     Raises:
         PhantomError: there are none, one of several is voxels, or one cannot be cut.

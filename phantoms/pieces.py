@@ -96,7 +96,7 @@ def freeze(target: object, **arrays: npt.NDArray[np.generic]) -> None:
 def boxes(
     scene: analytic.Scene, surfaces: Sequence[Surface] = (), voxels: Voxels | None = None
 ) -> list[tuple[FloatArray, FloatArray]]:
-    """Low and high corner of the box around each part, (3,) each [mm]."""
+    """Compute the low and high corner of the box around each part, (3,) each [mm]."""
     found = [bounds(solid.shape) for solid in scene.solids]
     found += [(one.vertices.min(axis=0), one.vertices.max(axis=0)) for one in surfaces]
     if voxels is not None:
@@ -106,7 +106,8 @@ def boxes(
 
 
 def size_about_origin(scene: analytic.Scene, surfaces: Sequence[Surface] = ()) -> analytic.Vector:
-    """Full extent along x, y, z [mm] of the box about the origin that holds everything.
+    """Compute the full extent along x, y, z [mm] of the box about the origin that
+    contains everything.
 
     Raises:
         PhantomError: there is nothing.
@@ -119,7 +120,7 @@ def size_about_origin(scene: analytic.Scene, surfaces: Sequence[Surface] = ()) -
 
 
 def bounds(shape: analytic.Shape) -> tuple[FloatArray, FloatArray]:
-    """Corners of the smallest axis-aligned box around the shape, (3,) each [mm].
+    """Compute the corners of the smallest axis-aligned box around the shape, (3,) each [mm].
 
     Raises:
         GeometryError: a shape that cannot be, such as an unbounded polyhedron.

@@ -49,19 +49,22 @@ _ELLIPSOIDS: Final = (
     (0.1, (0.0230, 0.046, 0.020), (0.06, -0.605, 0.0), 0.0),
 )
 _CUBOID: Final = re.compile(r"([a-z]+)-([1-9][0-9]{0,3})")
-FILLED: Final = 1e-3
-"""How far the filled part of a voxel may lie outside 0 to 1."""
-TEXTS: Final = (".toml", ".json")
-FORMS: Final = (
+FILLED_TOLERANCE: Final = 1e-3
+"""Distance by which the filled part of a voxel may be outside 0 to 1."""
+TEXT_SUFFIXES: Final = (".toml", ".json")
+"""Suffixes of phantom and scene files."""
+ALLOWED_FORMS: Final = (
     "a phantom or its name, the path of a file (TOML, JSON, " + ", ".join(FORMATS).upper() + "), a "
     "Volume, an array [z, y, x] with voxel_mm, a mesh with vertices and faces, a Scene or Solid, a "
     "dictionary as in a scene file, (any of these, material), or a list of them"
 )
+"""Kinds of samples, for error messages."""
 
 
 @public
 def shepp_logan(size_mm: float = 50.0) -> Phantom:
-    """The phantom scaled so that its unit cube [-1, 1] measures `size_mm` [mm] along each side.
+    """Make the phantom scaled so that its unit cube [-1, 1] measures `size_mm` [mm] along
+    each side.
 
     Example:
         >>> len(shepp_logan(50.0).scene.solids)
@@ -95,7 +98,7 @@ _MAKERS: Final[Mapping[str, Callable[[], Phantom]]] = {
 
 
 def phantom_names() -> tuple[str, ...]:
-    """Names that `load_phantom` knows; each cuboid also as NAME-K with K beads.
+    """List the names that `load_phantom` knows; each cuboid also as NAME-K with K beads.
 
     Example:
         >>> "lego" in phantom_names()
@@ -105,7 +108,7 @@ def phantom_names() -> tuple[str, ...]:
 
 
 def is_shipped(name: str) -> bool:
-    """Whether `load_phantom` knows `name`, a cuboid with K beads included.
+    """Return whether `load_phantom` knows `name`, a cuboid with K beads included.
 
     Example:
         >>> is_shipped("normal-7"), is_shipped("apple")
@@ -117,7 +120,7 @@ def is_shipped(name: str) -> bool:
 
 @public
 def load_phantom(name: str) -> Phantom:
-    """The phantom called `name`; a bare cuboid's name has five beads.
+    """Make the phantom called `name`; a bare cuboid's name has five beads.
 
     Raises:
         UnknownNameError: lists the available names.
@@ -145,19 +148,22 @@ def as_phantom(
     voxel_mm: float | Vector | None = None,
     priority: Sequence[float] = (),
 ) -> Phantom:
-    """A sample as a phantom.
+    """Convert a sample to a phantom.
 
     Args:
-        sample: a Phantom or the name of one that ships; the path of a phantom or scene file, or of
-            a mesh; a Volume; an array [z, y, x]; a mesh with `vertices` (n, 3) and `faces` (m, 3)
-            [mm], such as trimesh's; a Scene or Solid; a dictionary as in a scene file; a pair
-            (any of these, material); or a list of them, which add up. One mesh stands with the
-            middle of its box on the axis; those of a list keep their places.
-        material: of a mesh (default: abs) or of an array. Without one an array holds attenuation
-            [1/mm], with one the part of each voxel that the material fills (0 to 1), and with
-            several, {1: "pmma", 2: "steel"}, the label of what fills it (0: nothing).
+        sample: a Phantom or the name of one that ships; the path of a phantom or scene
+            file, or of a mesh; a Volume; an array [z, y, x]; a mesh with `vertices` (n,
+            3) and `faces` (m, 3) [mm], such as trimesh's; a Scene or Solid; a dictionary
+            as in a scene file; a pair (any of these, material); or a list of them, which
+            add up. One mesh stands with the middle of its box on the axis; those of a
+            list keep their places.
+        material: of a mesh (default: abs) or of an array. Without one an array holds
+            attenuation [1/mm], with one the part of each voxel that the material fills (0
+            to 1), and with several, {1: "pmma", 2: "steel"}, the label of what fills it
+            (0: nothing).
         voxel_mm: edge of an array's voxels, one or along x, y, z [mm].
-        priority: of each of a list: where meshes overlap, the one of the highest is there alone.
+        priority: of each of a list: where meshes overlap, the one of the highest is there
+            alone.
 
     Raises:
         PhantomError, UnknownNameError: what was given, and what is allowed.
@@ -176,6 +182,12 @@ def _one(
     sample: object, material: str | Mapping[int, str] | None, voxel_mm: float | Vector | None,
     keep: bool, priority: Sequence[float] = (),
 ) -> Phantom:  # fmt: skip
+    """Convert a sample of any kind to a phantom.
+
+    Args:
+        sample, material, voxel_mm, priority: as for `as_phantom`.
+        keep: leave meshes at their own places.
+    """
     given: Any = sample
     if isinstance(material, Mapping):
         return _labelled(sample, material, voxel_mm)
@@ -203,16 +215,20 @@ def _one(
     if isinstance(sample, Sequence) and sample:
         parts = [_one(each, None, voxel_mm, keep=True) for each in sample]
         return assemble("scene", parts, priority=priority)
-    raise PhantomError.instead(f"a sample cannot be {_shown(sample)}", _shown(sample), FORMS)
+    raise PhantomError.instead(
+        f"a sample cannot be {_shown(sample)}", _shown(sample), ALLOWED_FORMS
+    )
 
 
 def _require_none(material: str | None, what: str) -> None:
+    """Raise PhantomError if `material` is given for `what`, which has its own."""
     if material is not None:
         said = f"{what} has its own materials; material is for a mesh or an array"
         raise PhantomError(said, {"asked": material, "allowed": None})
 
 
 def _named(word: str, material: str | None, keep: bool) -> Phantom:
+    """Make the phantom of a path or a shipped name."""
     path = Path(word)
     kind = path.suffix.lower()
     if kind.lstrip(".") in FORMATS:
@@ -221,11 +237,11 @@ def _named(word: str, material: str | None, keep: bool) -> Phantom:
     _require_none(material, repr(word))
     if is_shipped(word):
         return load_phantom(word)
-    if kind in TEXTS or path.is_file():
+    if kind in TEXT_SUFFIXES or path.is_file():
         return files.read_phantom_file(path)
     raise UnknownNameError(
         f"no sample {word!r}: neither a phantom that ships ({', '.join(phantom_names())}) nor a "
-        f"file ending with {', '.join(TEXTS)}, {', '.join('.' + f for f in FORMATS)}",
+        f"file ending with {', '.join(TEXT_SUFFIXES)}, {', '.join('.' + f for f in FORMATS)}",
         {"asked": word, "allowed": list(phantom_names())},
     )
 
@@ -233,6 +249,7 @@ def _named(word: str, material: str | None, keep: bool) -> Phantom:
 def _array(
     values: np.ndarray[Any, Any], material: str | None, voxel_mm: float | Vector | None
 ) -> Phantom:
+    """Make the phantom of an array: attenuation, or the part that `material` fills."""
     if voxel_mm is None:
         raise PhantomError(
             "an array needs voxel_mm, the edge of its voxels [mm]; or give a Volume",
@@ -244,7 +261,7 @@ def _array(
     data = values.astype(np.float32)
     if material is not None:
         low, high = float(data.min()), float(data.max())
-        if low < -FILLED or high > 1.0 + FILLED:
+        if low < -FILLED_TOLERANCE or high > 1.0 + FILLED_TOLERANCE:
             raise PhantomError(
                 f"with material={material!r} an array holds the part of each voxel that it fills, "
                 f"0 to 1, and this one goes from {low:g} to {high:g}; for an array of labels give "
@@ -256,7 +273,7 @@ def _array(
 
 
 def _labelled(sample: object, names: Mapping[int, str], voxel_mm: float | Vector | None) -> Phantom:
-    """Voxels of several materials, from an array of labels or a Volume that holds them."""
+    """Make voxels of several materials from an array of labels or a Volume that holds them."""
     labels: Any = sample.data if isinstance(sample, Volume) else sample
     if not isinstance(labels, np.ndarray) or labels.dtype.kind not in "buif":
         raise PhantomError(
@@ -287,6 +304,7 @@ def _labelled(sample: object, names: Mapping[int, str], voxel_mm: float | Vector
 
 
 def _mesh(mesh: Any, material: str | None, keep: bool) -> Phantom:
+    """Make the phantom of an object with vertices and faces."""
     import trimesh
 
     vertices: FloatArray = np.array(mesh.vertices, dtype=np.float64)
@@ -298,9 +316,11 @@ def _mesh(mesh: Any, material: str | None, keep: bool) -> Phantom:
 
 
 def _solids(scene: Scene) -> Phantom:
+    """Make the phantom of a scene."""
     return Phantom("scene", f"{len(scene.solids)} solids", scene, size_about_origin(scene))
 
 
 def _shown(sample: object) -> str:
+    """Format a sample briefly, for error messages."""
     text = repr(sample)
     return f"{type(sample).__name__} {text}" if len(text) <= 60 else type(sample).__name__

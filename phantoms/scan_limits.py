@@ -22,12 +22,12 @@ from flexdt.twin.script.scan_request import ScanRequest
 
 __all__ = ["check_distances", "check_placement", "check_tube", "open_beam_doubts"]
 
-USELESS: Final = ("source in the sample", "panel in the sample", "sample not seen")
-"""Findings of a placement whose images show nothing of use."""
+USELESS_PLACEMENTS: Final = ("source in the sample", "panel in the sample", "sample not seen")
+"""Findings about placements whose images are useless."""
 
 
 def check_tube(machine: Machine, exposure: ExposureSettings) -> None:
-    """Refuse a voltage or power that the machine's tube does not have.
+    """Check that the machine's tube has a voltage and power.
 
     Raises:
         LimitError: says what was asked and what is allowed.
@@ -43,7 +43,7 @@ def check_distances(
     sod_mm: float,
     sdd_mm: float,
 ) -> None:
-    """Refuse an exposure or distances that the machine does not have.
+    """Check that the machine has an exposure and distances.
 
     Args:
         machine: whose camera and motors these are.
@@ -62,7 +62,7 @@ def check_distances(
 
 
 def check_placement(phantom: Phantom, cone_vec: ConeVec, shape: tuple[int, int]) -> None:
-    """Refuse a source or a panel within the sample, and a sample that no ray meets.
+    """Check that source and panel are outside the sample, and that some ray meets it.
 
     Args:
         phantom: stands around the origin.
@@ -74,7 +74,9 @@ def check_placement(phantom: Phantom, cone_vec: ConeVec, shape: tuple[int, int])
     """
     half = np.array(phantom.size_mm) / 2.0
     found = examine(Operation.SIMULATE, cone_vec, shape, boxes=[[-half, half]])
-    settled([replace(one, severity=Severity.REFUSAL) for one in found if one.kind in USELESS])
+    settled(
+        [replace(one, severity=Severity.REFUSAL) for one in found if one.kind in USELESS_PLACEMENTS]
+    )
 
 
 def open_beam_doubts(
@@ -84,7 +86,7 @@ def open_beam_doubts(
     view: npt.ArrayLike,
     physics: Physics = "poly",
 ) -> list[str]:
-    """Warn where the open beam saturates or starves the panel.
+    """Warn if the open beam saturates or starves the panel.
 
     Args:
         machine: its tube and detector.

@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     import trimesh
 
 SPHERE_SUBDIVISIONS = 3
-"""Times that an icosahedron's triangles are quartered."""
+"""Number of times that an icosahedron's triangles are quartered."""
 CYLINDER_SECTIONS = 48
-"""Sides of the prism that stands for a cylinder."""
+"""Number of sides of the prism of a cylinder."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +80,7 @@ def parts_of(
 
 
 def joined(parts: Sequence[SurfacePart]) -> trimesh.Trimesh:
-    """All parts as one mesh, holes turned inside out.
+    """Join all parts into one mesh, holes turned inside out.
 
     Raises:
         PhantomError: there is nothing to join.
@@ -97,7 +97,8 @@ def joined(parts: Sequence[SurfacePart]) -> trimesh.Trimesh:
 
 
 def _is_hole(solid: analytic.Solid, beads: FloatArray) -> bool:
-    """A negative solid is a hole unless it is a bead that absorbs less than its body."""
+    """Return whether a solid is a hole: negative, and not a bead that absorbs less than
+    its body."""
     if solid.mu_per_mm >= 0.0:
         return False
     if isinstance(solid.shape, analytic.Sphere) and len(beads):
@@ -106,7 +107,8 @@ def _is_hole(solid: analytic.Solid, beads: FloatArray) -> bool:
 
 
 def solid_mesh(solid: analytic.Solid, around: bool = False) -> trimesh.Trimesh:
-    """Closed outward mesh of one solid [mm]; a round shape's is inscribed, or lies around it."""
+    """Make the closed outward mesh of one solid [mm]; a round shape's is inscribed, or
+    lies around it."""
     mesh = _mesh(solid.shape)
     if around and isinstance(solid.shape, analytic.Sphere | analytic.Ellipsoid):
         mesh.vertices = solid.shape.center + (mesh.vertices - solid.shape.center) * _ball_around()
@@ -121,7 +123,7 @@ def solid_mesh(solid: analytic.Solid, around: bool = False) -> trimesh.Trimesh:
 
 @lru_cache
 def _unit_ball() -> trimesh.Trimesh:
-    """The polyhedron inscribed in a ball of radius 1; made once, as it takes milliseconds."""
+    """Make the polyhedron inscribed in a ball of radius 1; once, as it takes milliseconds."""
     import trimesh
 
     ball: trimesh.Trimesh = trimesh.creation.icosphere(SPHERE_SUBDIVISIONS, radius=1.0)
@@ -130,13 +132,14 @@ def _unit_ball() -> trimesh.Trimesh:
 
 @lru_cache
 def _ball_around() -> float:
-    """Scale at which the inscribed polyhedron of a ball holds the ball."""
+    """Compute the scale at which the inscribed polyhedron of a ball contains the ball."""
     ball = _unit_ball()
     corners = ball.vertices[ball.faces[:, 0]]
     return 1.0 / float(np.einsum("ij,ij->i", ball.face_normals, corners).min())
 
 
 def _mesh(shape: analytic.Shape) -> trimesh.Trimesh:
+    """Make the mesh of a shape [mm]."""
     import trimesh
 
     mesh: trimesh.Trimesh

@@ -21,8 +21,9 @@ from flexdt.twin.projection import Volume
 from flexdt.twin.projection.analytic_solids import Scene, Shape, Vector, as_convex
 
 MAX_VOXELS: Final = 1 << 30
-MAX_LEAKS: Final = 1e-3
-"""Allowed fraction of columns that do not close: a mesh with a few bad faces still fills."""
+"""Largest number of voxels of a grid."""
+MAX_LEAK_SHARE: Final = 1e-3
+"""Largest part of columns that do not close: a mesh with a few bad faces is still filled."""
 
 _Interval = tuple[FloatArray, FloatArray]
 
@@ -30,7 +31,7 @@ _Interval = tuple[FloatArray, FloatArray]
 def voxelise(
     scene: Scene, surfaces: Sequence[Surface], size_mm: Vector, voxel_mm: float, oversample: int
 ) -> Volume:
-    """Attenuation [1/mm] of a scene and of meshes on a grid about the origin.
+    """Sample the attenuation [1/mm] of a scene and of meshes on a grid about the origin.
 
     Args:
         scene: analytic solids, added up.
@@ -63,13 +64,15 @@ def voxelise(
 
 
 def as_volume(voxels: Voxels) -> Volume:
-    """A ready grid as the projector's volume."""
+    """Convert a ready grid to the projector's volume."""
     return Volume(voxels.data, voxels.voxel_mm, voxels.center_mm)
 
 
 def _add_solid(
     data: npt.NDArray[np.float32], shape: Shape, mu: float, voxel_mm: float, oversample: int
 ) -> None:
+    """Add a convex solid to `data` [z, y, x], with `oversample` columns per voxel along x
+    and y."""
     from flexdt.phantoms import voxelise_kernels as kernels
 
     nz, ny, nx = data.shape
@@ -97,6 +100,7 @@ def _add_solid(
 def _add_surface(
     data: npt.NDArray[np.float32], surface: Surface, voxel_mm: float, oversample: int
 ) -> None:
+    """Add a filled mesh to `data` [z, y, x]; raise PhantomError if it is not closed."""
     from flexdt.phantoms import voxelise_kernels as kernels
 
     nz, ny, nx = data.shape
@@ -115,15 +119,16 @@ def _add_surface(
         data, starts, counts, heights, signs, oversample, surface.mu_per_mm / oversample**2
     )
     hit = int(np.count_nonzero(counts))
-    if leaks > MAX_LEAKS * hit:
+    if leaks > MAX_LEAK_SHARE * hit:
         raise PhantomError(
             f"the mesh is not closed: {leaks} of {hit} columns through it do not end; repair it "
             "(close holes, orient faces) and try again",
-            {"asked": leaks, "allowed": int(MAX_LEAKS * hit)},
+            {"asked": leaks, "allowed": int(MAX_LEAK_SHARE * hit)},
         )
 
 
 def _range(low: float, high: float, n: int, voxel_mm: float) -> tuple[int, int]:
+    """Return the first and last + 1 voxel of an extent along one axis."""
     return (
         max(math.floor(low / voxel_mm + n / 2.0 - 1e-9), 0),
         min(math.ceil(high / voxel_mm + n / 2.0 + 1e-9), n),
@@ -131,7 +136,8 @@ def _range(low: float, high: float, n: int, voxel_mm: float) -> tuple[int, int]:
 
 
 def _columns(shape: Shape, x: FloatArray, y: FloatArray) -> _Interval:
-    """Lowest and highest z of the shape above each (x, y) [mm]; lowest > highest: no hit."""
+    """Compute the lowest and highest z of the shape above each (x, y) [mm]; lowest >
+    highest: no hit."""
     one = as_convex(shape)
     bottom, top = _between_slabs(one.slabs, x, y)
     if one.curved:
@@ -141,7 +147,8 @@ def _columns(shape: Shape, x: FloatArray, y: FloatArray) -> _Interval:
 
 
 def _quadric(to_unit: FloatArray, center: FloatArray, x: FloatArray, y: FloatArray) -> _Interval:
-    """Interval where |to_unit (p - center)| <= 1 along z; unbounded in an upright cylinder."""
+    """Solve for the interval where |to_unit (p - center)| <= 1 along z; unbounded in an
+    upright cylinder."""
     cx, cy, cz = center
     direction = to_unit[:, 2]
     a = float(direction @ direction)
@@ -158,7 +165,7 @@ def _quadric(to_unit: FloatArray, center: FloatArray, x: FloatArray, y: FloatArr
 
 
 def _between_slabs(slabs: FloatArray, x: FloatArray, y: FloatArray) -> _Interval:
-    """Interval where low <= n . p <= high for all slabs (k, 5) = n, low, high."""
+    """Compute the interval where low <= n . p <= high for all slabs (k, 5) = n, low, high."""
     zero = np.zeros(np.broadcast_shapes(x.shape, y.shape))
     bottom, top = zero - np.inf, zero + np.inf
     for nx, ny, nz, low, high in slabs:

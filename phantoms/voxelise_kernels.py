@@ -48,10 +48,11 @@ def add_convex(data, low, high, x0, y0, oversample, value):
 
 @linked
 def _side(ax, ay, bx, by, px, py):
-    """Signed crossing of the ray from (px, py) towards +x with the edge a -> b: -1, 0 or +1.
+    """Compute the signed crossing of the ray from (px, py) towards +x with the edge a ->
+    b: -1, 0 or +1.
 
-    The end points are put in a fixed order first, so both triangles on an edge get the same answer
-    to the last bit and no column slips through or counts twice.
+    The end points are put in a fixed order first, so both triangles on an edge get the
+    same answer to the last bit and no column slips through or counts twice.
     """
     if (ay > py) == (by > py):
         return 0
@@ -66,7 +67,8 @@ def _side(ax, ay, bx, by, px, py):
 
 @linked
 def _winding(t, px, py):
-    """Winding number of the projected triangle t (3, 3) about (px, py): -1, 0 or +1."""
+    """Compute the winding number of the projected triangle t (3, 3) about (px, py): -1, 0
+    or +1."""
     return (
         _side(t[0, 0], t[0, 1], t[1, 0], t[1, 1], px, py)
         + _side(t[1, 0], t[1, 1], t[2, 0], t[2, 1], px, py)
@@ -76,7 +78,8 @@ def _winding(t, px, py):
 
 @linked
 def _height(t, px, py):
-    """Height of the plane of triangle t above (px, py), kept within the triangle's heights."""
+    """Compute the height of the plane of triangle t above (px, py), within the triangle's
+    heights."""
     ux, uy, uz = t[1, 0] - t[0, 0], t[1, 1] - t[0, 1], t[1, 2] - t[0, 2]
     vx, vy, vz = t[2, 0] - t[0, 0], t[2, 1] - t[0, 1], t[2, 2] - t[0, 2]
     area = ux * vy - uy * vx
@@ -89,7 +92,7 @@ def _height(t, px, py):
 
 @linked
 def _span(low, high, n):
-    """Sub-column indices whose centres i + 0.5 can lie in [low, high]."""
+    """Compute the sub-column indices whose centres i + 0.5 can lie in [low, high]."""
     return max(int(np.floor(low - 0.5)), 0), min(int(np.ceil(high - 0.5)) + 1, n)
 
 

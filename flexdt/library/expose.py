@@ -10,7 +10,7 @@ import numpy as np
 from flexdt.library.data_set import DataSet
 from flexdt.library.datasets.image_doubts import DARK
 from flexdt.library.reading.folders import load_dataset
-from flexdt.phantoms.exposure_forecast import VIEWS, Forecast, Transmission, expose
+from flexdt.phantoms.exposure_forecast import SIMULATED_VIEWS, Forecast, Transmission, expose
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.physics.exposure import FEW_COUNTS
 
@@ -40,7 +40,7 @@ def exposure_of(data: DataSet | str | PathLike[str]) -> Measured:
         DatasetFormatError: no pixel of its flat image is brighter than the dark one.
     """
     scan = data if isinstance(data, DataSet) else load_dataset(data)
-    wanted = np.unique(np.linspace(0, len(scan.present) - 1, VIEWS).astype(int))
+    wanted = np.unique(np.linspace(0, len(scan.present) - 1, SIMULATED_VIEWS).astype(int))
     counts = np.stack([scan.counts(scan.present[i]) for i in wanted])
     alive = scan.flat > scan.dark
     if not alive.any():

@@ -32,35 +32,39 @@ if TYPE_CHECKING:
     import trimesh
 
 FORMATS: Final = ("stl", "obj", "ply", "glb", "off")
-"""The wire has the same names (`MeshFormat` of the protocol)."""
+"""Formats of mesh files; the wire has the same names (`MeshFormat` of the protocol)."""
 DEFAULT_UNIT: Final[Mapping[str, str]] = {"glb": "m"}
 """Unit of the formats that have one; the others are in mm unless a unit is given."""
 MAX_BYTES: Final = 256 << 20
+"""Largest mesh file [bytes]."""
 MAX_FACES: Final = 4_000_000
 MAX_EXTENT_MM: Final = 2000.0
 PART_FORMATS: Final = ("glb", "stl")
 MAX_PART_BYTES: Final = 32 << 20
 MAX_PART_FACES: Final = 300_000
 MAX_PART_MM: Final = 20_000.0
-"""Of a machine's part: browsers draw a dozen of them at once."""
+"""Largest extent of a machine's part [mm]; browsers draw a dozen parts at once."""
 MAX_PLY_HEADER: Final = 1 << 16
 MAX_GLB_DOCUMENT: Final = 32 << 20
 MAX_PARTS: Final = 1000
-"""Nodes of a GLB file, and primitives, each counted as often as it stands in the scene: trimesh
-walks from the scene's root to each."""
-HARMLESS: Final = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "EXT_texture_")
-"""Beginnings of the names of glTF extensions that change how a thing looks, not its shape."""
+"""Largest number of nodes and primitives of a GLB file, each counted as often as the
+scene has it.
+
+trimesh walks from the scene's root to each.
+"""
+HARMLESS_EXTENSIONS: Final = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "EXT_texture_")
+"""Prefixes of glTF extensions that change how an object looks, not its shape."""
 ITEM_BYTES: Final = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 ITEM_COLUMNS: Final = {
     "SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16,
 }  # fmt: skip
 """Sizes of glTF's component types and element types (glTF 2.0 specification, 3.6.2)."""
 TRIANGLE_FAN: Final = 6
-STL_HEAD: Final = 84
-STL_TRIANGLE: Final = 50
-"""Bytes of a binary STL before its triangles, and of each."""
+STL_HEAD_BYTES: Final = 84
+STL_TRIANGLE_BYTES: Final = 50
+"""Bytes of a triangle of a binary STL, after a head of `STL_HEAD_BYTES`."""
 MAX_PLANES: Final = 128
-"""A convex mesh with at most so many planes is projected as a solid, others as their triangles."""
+"""Largest number of planes of a convex mesh that is projected as a solid, not as triangles."""
 
 
 @public
@@ -74,22 +78,23 @@ def mesh_phantom(
     place: Literal["center", "keep"] = "center",
     at_mm: Vector = (0.0, 0.0, 0.0),
 ) -> Phantom:
-    """A phantom filled with one material inside a closed mesh.
+    """Make a phantom filled with one material inside a closed mesh.
 
     Args:
-        source: the bytes of an STL, OBJ, PLY, GLB or OFF file, or its path. Bodies of a GLB scene
-            are taken together, each where it stands.
-        unit: length unit of the file's numbers: um, mm, cm, m, inch; default: that of the format,
-            m for GLB, and mm where it has none.
+        source: the bytes of an STL, OBJ, PLY, GLB or OFF file, or its path. Bodies of a
+            GLB scene are taken together, each where it stands.
+        unit: length unit of the file's numbers: um, mm, cm, m, inch; default: that of the
+            format, m for GLB, and mm where it has none.
         material: what fills it.
         file_type: one of `FORMATS`; default: by the path's suffix (bytes need it).
         name: default: the path's stem, or "mesh".
-        place: "center" puts the middle of its box on the axis at the reference height; "keep"
-            takes the file's origin for that point.
+        place: "center" puts the middle of its box on the axis at the reference height;
+            "keep" takes the file's origin for that point.
         at_mm: moves it from there, along x, y, z of the object's frame [mm].
 
     Returns:
-        A solid between planes when the mesh is convex with few of them, else its triangles. Both
+        A solid between planes when the mesh is convex with few of them, else its
+        triangles. Both
         are projected exactly.
 
     Raises:
@@ -127,13 +132,14 @@ def filled_mesh(
     place: Literal["center", "keep"] = "center",
     at_mm: Vector = (0.0, 0.0, 0.0),
 ) -> Phantom:
-    """A phantom filled with one material inside a closed mesh that has been read already.
+    """Make a phantom filled with one material inside a closed mesh that has been read already.
 
     Args:
         mesh: its triangles; not changed.
         unit, material, name, place: as for `mesh_phantom`.
         label: of the mesh, for errors.
-        at_mm: where its middle, or the origin it keeps, comes to lie in the object's frame [mm].
+        at_mm: where its middle, or the origin it keeps, comes to lie in the object's
+            frame [mm].
 
     Raises:
         PhantomError, UnknownNameError: as `mesh_phantom`.
@@ -171,7 +177,7 @@ def filled_mesh(
 
 
 def read_mesh(source: bytes | str | os.PathLike[str]) -> trimesh.Trimesh:
-    """The triangles of a file, closed, wound outwards, in its own units.
+    """Read the triangles of a file, closed, wound outwards, in its own units.
 
     Raises:
         PhantomError: format, size or content; says what is allowed.
@@ -181,7 +187,8 @@ def read_mesh(source: bytes | str | os.PathLike[str]) -> trimesh.Trimesh:
 
 
 def read_part(path: str | os.PathLike[str]) -> trimesh.Trimesh:
-    """The triangles of a machine's part [mm], from a GLB (m) or STL file (mm); they may be open.
+    """Read the triangles of a machine's part [mm], from a GLB (m) or STL file (mm); they
+    may be open.
 
     Raises:
         PhantomError: no such file, its format, size or content; says what is allowed.
@@ -206,7 +213,7 @@ def read_part(path: str | os.PathLike[str]) -> trimesh.Trimesh:
 
 
 def default_unit(file_type: str) -> str:
-    """The unit of a format's numbers where none is given."""
+    """Return the unit of a format's numbers where none is given."""
     return DEFAULT_UNIT.get(file_type, "mm")
 
 
@@ -219,15 +226,15 @@ def voxel_phantom(
     center_mm: Vector = (0.0, 0.0, 0.0),
     material: str | None = None,
 ) -> Phantom:
-    """A phantom from a ready grid.
+    """Make a phantom from a ready grid.
 
     Args:
         data: [z, y, x], attenuation [1/mm].
         voxel_mm: voxel edge, one or along x, y, z [mm].
         name: its name.
         center_mm: where the grid's centre lies in the object's frame [mm].
-        material: what it is made of, for its spectrum: a voxel's amount is its attenuation over
-            the material's. None: water of varying density.
+        material: what it is made of, for its spectrum: a voxel's amount is its
+            attenuation over the material's. None: water of varying density.
 
     Raises:
         PhantomError: shape, values or voxel size.
@@ -253,6 +260,8 @@ def voxel_phantom(
 
 
 def _read(source: bytes | str | os.PathLike[str], file_type: str | None) -> tuple[bytes, str, str]:
+    """Read a file, or take bytes; return content, format and label, with size and format
+    checked."""
     if isinstance(source, bytes):
         raw, label, kind = source, "mesh", file_type or ""
     else:
@@ -274,11 +283,21 @@ def _read(source: bytes | str | os.PathLike[str], file_type: str | None) -> tupl
 
 
 def _check_size(size: int, label: str) -> None:
+    """Check the size of a file [bytes]."""
     if not 0 < size <= MAX_BYTES:
         raise PhantomError.instead(f"{label} has {size} bytes", size, f"1 to {MAX_BYTES}")
 
 
 def _parse(raw: bytes, kind: str) -> trimesh.Trimesh:
+    """Parse a mesh file with trimesh, claims checked before and content after.
+
+    Args:
+        raw: content.
+        kind: one of `FORMATS`.
+
+    Raises:
+        PhantomError: not readable, too large, or without triangles.
+    """
     import trimesh
 
     mesh: object
@@ -312,7 +331,8 @@ def _parse(raw: bytes, kind: str) -> trimesh.Trimesh:
 
 
 def _check_ply(raw: bytes) -> None:
-    """The header is there, small, and claims no more elements than there are bytes."""
+    """Check that the header is there, small, and claims no more elements than there are
+    bytes."""
     end = raw.find(b"end_header", 0, MAX_PLY_HEADER)
     if not raw.startswith(b"ply") or end < 0:
         raise ValueError(f"no PLY header within {MAX_PLY_HEADER} bytes")
@@ -325,7 +345,8 @@ def _check_ply(raw: bytes) -> None:
 
 
 def _check_glb(raw: bytes) -> None:
-    """The file refers to no other, claims no more than it holds, and puts each node in one place.
+    """Check that the file refers to no other, claims no more than it holds, and puts each
+    node in one place.
 
     trimesh allocates what the document claims, and copies a mesh to each of its places.
     """
@@ -342,8 +363,9 @@ def _check_glb(raw: bytes) -> None:
 
 
 def _check_gltf(document: Any, total: int) -> None:
+    """Check the JSON document of a GLB file of `total` bytes."""
     for name in document.get("extensionsRequired", []):
-        if not name.startswith(HARMLESS):
+        if not name.startswith(HARMLESS_EXTENSIONS):
             raise ValueError(f"it needs the extension {name[:80]!r}, which is not read here")
     if any("uri" in buffer for buffer in document.get("buffers", [])):
         raise ValueError("its data are not in this file")
@@ -378,10 +400,10 @@ def _check_gltf(document: Any, total: int) -> None:
 
 def _check_stl(raw: bytes) -> None:
     """Compare the length of a binary file with the one that its head announces."""
-    if len(raw) < STL_HEAD or (raw.lstrip()[:5] == b"solid" and b"facet" in raw[:1024]):
+    if len(raw) < STL_HEAD_BYTES or (raw.lstrip()[:5] == b"solid" and b"facet" in raw[:1024]):
         return
-    count = int.from_bytes(raw[STL_HEAD - 4 : STL_HEAD], "little")
-    announced = STL_HEAD + STL_TRIANGLE * count
+    count = int.from_bytes(raw[STL_HEAD_BYTES - 4 : STL_HEAD_BYTES], "little")
+    announced = STL_HEAD_BYTES + STL_TRIANGLE_BYTES * count
     if announced != len(raw) and count:
         raise ValueError(
             f"its head announces {count} triangles, {announced} bytes; it has {len(raw)} bytes"
@@ -389,10 +411,11 @@ def _check_stl(raw: bytes) -> None:
 
 
 _CHECKS: Final = {"glb": _check_glb, "ply": _check_ply, "stl": _check_stl}
-"""What is checked of a file's claims before trimesh reads it."""
+"""Format -> check of a file's claims before trimesh reads it."""
 
 
 def _closed(mesh: trimesh.Trimesh, label: str) -> trimesh.Trimesh:
+    """Merge vertices, check that the mesh is closed, and wind it outwards."""
     import trimesh
 
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
@@ -441,7 +464,7 @@ def _wound(faces: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
 
 
 def _convex(mesh: trimesh.Trimesh, vertices: FloatArray) -> ConvexPolyhedron | None:
-    """The mesh as half-spaces if it is convex and has few planes."""
+    """Convert the mesh to half-spaces if it is convex and has few planes, else return None."""
     if not mesh.is_convex:
         return None
     normals = np.asarray(mesh.face_normals, dtype=np.float64)

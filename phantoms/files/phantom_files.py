@@ -33,16 +33,19 @@ from flexdt.twin.length_units import UNITS_MM
 from flexdt.twin.projection import TriangleMesh
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Vector
 
-CHECKED_ALONG: Final = 96
-"""Voxels along the longest side in which `require_replaced` looks."""
-ABSENT: Final = 0.25
+CHECKED_VOXELS_ALONG: Final = 96
+"""Number of voxels along the longest side in which `require_replaced` looks."""
+MAX_ABSENT_SHARE: Final = 0.25
 """Part of a voxel that may be replaced without being there."""
 MAX_SENT_SOLIDS: Final = 500
-"""Each becomes up to 1280 triangles where shapes are drawn and checked for collisions."""
+"""Largest number of solids of a file that a client sends.
+
+Each becomes up to 1280 triangles where shapes are drawn and checked for collisions.
+"""
 
 
 def read_phantom_file(path: Path) -> Phantom:
-    """The phantom of a TOML or JSON file; meshes that a scene names lie beside it.
+    """Read the phantom of a TOML or JSON file; meshes that a scene names are beside it.
 
     Raises:
         PhantomError: names file, key path, value and what is allowed.
@@ -56,7 +59,7 @@ def read_phantom_file(path: Path) -> Phantom:
 
 
 def load_phantom_file(text: str, file: str = "<phantom>", folder: Path | None = None) -> Phantom:
-    """The phantom of a TOML or JSON text.
+    """Parse the phantom of a TOML or JSON text.
 
     Args:
         text: content; JSON if it starts with a brace.
@@ -78,7 +81,8 @@ def load_phantom_file(text: str, file: str = "<phantom>", folder: Path | None = 
 
 
 def phantom_of(document: Mapping[str, object], folder: Path | None = None) -> Phantom:
-    """The phantom of a document in any of the three forms; raises as `load_phantom_file`."""
+    """Make the phantom of a document in any of the three forms; raises as
+    `load_phantom_file`."""
     if "scene" in document:
         return Phantom.from_dict(document)
     if "solid" in document or "mesh" in document:
@@ -87,12 +91,14 @@ def phantom_of(document: Mapping[str, object], folder: Path | None = None) -> Ph
 
 
 def _version(value: object, where: str) -> object:
+    """Check the version of a document."""
     if value != 1:
         raise reading.wrong(value, where, "1")
     return value
 
 
 def _scene_file(document: Mapping[str, object], folder: Path | None) -> Phantom:
+    """Make the phantom of a scene: solids and meshes with their priorities."""
     given = reading.fields(document, "phantom", {}, {
         "schema": _version, "name": reading.string, "description": reading.string,
         "solid": partial(reading.each, read=solids_of),
@@ -111,7 +117,7 @@ def _scene_file(document: Mapping[str, object], folder: Path | None) -> Phantom:
 
 
 def require_replaced(phantom: Phantom, solids: object) -> None:
-    """Check that what solids of a scene file, one or a list of anything, replace is there, once.
+    """Check that the material that solids of a scene file replace is there, once.
 
     Raises:
         PhantomError: names the material.
@@ -123,9 +129,9 @@ def require_replaced(phantom: Phantom, solids: object) -> None:
     for name in dict.fromkeys(told):
         there = tuple(one for one in phantom.scene.solids if one.material == name)
         meshes = [one for one in phantom.surfaces if one.material == name]
-        edge = max(phantom.size_mm) / CHECKED_ALONG
+        edge = max(phantom.size_mm) / CHECKED_VOXELS_ALONG
         least = float(voxelise(Scene(there), meshes, phantom.size_mm, edge, 2).data.min())
-        if least < -ABSENT * material_of(name).mu_per_mm:
+        if least < -MAX_ABSENT_SHARE * material_of(name).mu_per_mm:
             raise PhantomError(
                 f"{name} is replaced where there is none of it, or twice; allowed: inside solids "
                 f"of {name} that are not replaced already",
@@ -134,7 +140,7 @@ def require_replaced(phantom: Phantom, solids: object) -> None:
 
 
 def solids_of(value: object, where: str) -> tuple[Solid, ...]:
-    """A solid `{kind, ..., material, replaces}` of a scene file, and the hole it fills."""
+    """Read a solid `{kind, ..., material, replaces}` of a scene file, and the hole it fills."""
     fields = dict(reading.mapping(value, where))
     made_of = material_of(reading.string(reading.get(fields, "material", where), where))
     instead = fields.pop("replaces", None)
@@ -148,7 +154,7 @@ def solids_of(value: object, where: str) -> tuple[Solid, ...]:
 
 
 def _mesh(value: object, where: str, folder: Path | None) -> tuple[Phantom, float]:
-    """The mesh of a scene file and its priority."""
+    """Read the mesh of a scene file and its priority."""
     given = reading.fields(
         value,
         where,
@@ -174,12 +180,14 @@ def _mesh(value: object, where: str, folder: Path | None) -> tuple[Phantom, floa
 
 
 def _unit(value: object, where: str) -> object:
+    """Check the name of a length unit."""
     if value not in UNITS_MM:
         raise reading.wrong(value, where, ", ".join(UNITS_MM))
     return value
 
 
 def _bead_file(document: Mapping[str, object]) -> Phantom:
+    """Make the phantom of a bead file: a body with beads, or with a spiral of them."""
     given = reading.fields(
         document,
         "phantom",
@@ -215,11 +223,14 @@ def _bead_file(document: Mapping[str, object]) -> Phantom:
 
 
 def _body(value: object, where: str) -> tuple[Vector, str]:
+    """Read the body: size [mm] and material."""
     given = reading.fields(value, where, {"size_mm": reading.lengths}, {"material": reading.string})
     return given["size_mm"], given.get("material", "abs")
 
 
 def _beads(value: object, where: str) -> tuple[tuple[Vector, float, str], ...]:
+    """Read beads: position [mm], radius [mm], material."""
+
     def read(one: object, at: str) -> tuple[Vector, float, str]:
         needed = {"position_mm": reading.vector, "radius_mm": reading.positive}
         given = reading.fields(one, at, needed, {"material": reading.string})
@@ -229,6 +240,7 @@ def _beads(value: object, where: str) -> tuple[tuple[Vector, float, str], ...]:
 
 
 def _spiral(value: object, where: str) -> tuple[int, float, str]:
+    """Read a spiral: number of beads, radius [mm], material."""
     others = {"radius_mm": reading.positive, "material": reading.string}
     given = reading.fields(value, where, {"beads": reading.positive}, others)
     if given["beads"] != int(given["beads"]):
@@ -237,7 +249,7 @@ def _spiral(value: object, where: str) -> tuple[int, float, str]:
 
 
 def sent_scene(text: bytes, *, name: str) -> Phantom:
-    """The phantom of a text that names no other file.
+    """Parse the phantom of a text that names no other file, and check its size.
 
     Args:
         text: UTF-8, TOML or JSON.

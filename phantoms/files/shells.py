@@ -9,22 +9,23 @@ import numpy.typing as npt
 
 from flexdt.twin.geometry.conventions import FloatArray
 
-MOST_SHELLS: Final = 200
-"""Above which none is looked at."""
+MAX_SHELLS: Final = 200
+"""Largest number of shells that are examined."""
 Faces = npt.NDArray[Any]
 
 
 def filled_twice(vertices: FloatArray, faces: Faces) -> int:
-    """How many shells that are turned outwards lie in what other shells fill.
+    """Count the shells turned outwards inside what other shells fill.
 
-    Such a shell changes nothing: where bodies overlap, path counts once. Cavities turn inwards.
+    Such a shell changes nothing: where bodies overlap, path counts once. Cavities turn
+    inwards.
 
     Args:
         vertices: (v, 3).
         faces: (f, 3), of closed shells.
     """
     shells = _shells(vertices, faces)
-    if not 1 < len(shells) <= MOST_SHELLS:
+    if not 1 < len(shells) <= MAX_SHELLS:
         return 0
     corners = [vertices[faces[shell]] for shell in shells]
     boxes = [(three.min(axis=(0, 1)), three.max(axis=(0, 1))) for three in corners]
@@ -39,7 +40,7 @@ def filled_twice(vertices: FloatArray, faces: Faces) -> int:
 
 
 def _shells(vertices: FloatArray, faces: Faces) -> list[npt.NDArray[np.intp]]:
-    """The faces of each connected surface."""
+    """Find the faces of each connected surface."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -53,9 +54,8 @@ def _shells(vertices: FloatArray, faces: Faces) -> list[npt.NDArray[np.intp]]:
 
 
 def _winding(point: FloatArray, triangles: FloatArray) -> float:
-    """How often triangles (f, 3, 3) wind about a point, by their solid angles (van Oosterom and
-    Strackee, IEEE Trans. Biomed. Eng. 30 (1983) 125).
-    """
+    """Compute the winding number of triangles (f, 3, 3) about a point, by their solid
+    angles (van Oosterom and Strackee, IEEE Trans. Biomed. Eng. 30 (1983) 125)."""
     a, b, c = (triangles[:, i] - point for i in range(3))
     la, lb, lc = (np.linalg.norm(edge, axis=1) for edge in (a, b, c))
     volume = np.einsum("ni,ni->n", a, np.cross(b, c))
