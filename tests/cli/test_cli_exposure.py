@@ -79,8 +79,10 @@ def test_run_and_snap_say_what_their_images_are(tmp_path: Path, capsys: Capture)
         assert run(["run", str(dim), "--out", "dim", *server]) == 0
         predicted = re.findall(r"about ([\d.e+-]+) % .* will be starved", capsys.readouterr().err)
         [kept] = json.loads((tmp_path / "data/dim/flexdt.json").read_text())["predicted"]
-        signal = [image.astype(float) - tifffile.imread(tmp_path / "data/dim/di000000.tif")
-                  for image in map(tifffile.imread, (tmp_path / "data/dim").glob("scan_*.tif"))]  # fmt: skip
+        folder = tmp_path / "data/dim"
+        dark = tifffile.imread(folder / "di000000.tif")
+        images = (tifffile.imread(path) for path in folder.glob("scan_*.tif"))
+        signal = [image.astype(float) - dark for image in images]
         starved = max(float((image < 10).mean()) for image in signal)
         assert kept["starved"] == pytest.approx(starved, abs=0.03)
         assert [float(one) / 100 for one in predicted] == [pytest.approx(kept["starved"], rel=0.01)]
