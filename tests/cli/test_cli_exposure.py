@@ -46,10 +46,9 @@ def test_check_foresees_saturated_and_starved_pixels(
     assert "_pixels" not in capsys.readouterr().out
 
 
-def share(text: str, name: str) -> float:
-    [found] = re.findall(
-        rf"([\d.e+-]+) % of the (?:projections' )?pixels (?:are|will be) {name}", text
-    )
+def share(text: str, state: str) -> float:
+    """Read the one share of pixels of which `text` says that they "are" or "will be" so."""
+    [found] = re.findall(rf"([\d.e+-]+) % of the (?:projections' )?pixels {state}", text)
     return float(found) / 100.0
 
 
@@ -62,16 +61,16 @@ def test_run_and_snap_say_what_their_images_are(tmp_path: Path, capsys: Capture)
         long = written(tmp_path, 700.0)
         capsys.readouterr()
         assert run(["run", str(long), "--out", "long", "--sample", "normal-5", *server]) == 0
-        told = share(capsys.readouterr().err, "saturated")
+        told = share(capsys.readouterr().err, "are saturated")
         saved = sorted((tmp_path / "data" / "long").glob("*.tif*"))
         counts = [tifffile.imread(file) for file in saved]
         assert any(abs((image == TOP).mean() - told) < 0.02 + 0.1 * told for image in counts)
         assert run(["check", str(long), "--sample", "normal-5"]) == 0
-        assert share(capsys.readouterr().err, "saturated") == pytest.approx(told, abs=0.02)
+        assert share(capsys.readouterr().err, "will be saturated") == pytest.approx(told, abs=0.02)
         snapped = tmp_path / "now.tif"
         assert run(["tube", "--on", *server]) == 0
         assert run(["snap", str(snapped), *server]) == 0
-        assert share(capsys.readouterr().err, "saturated") == pytest.approx(
+        assert share(capsys.readouterr().err, "are saturated") == pytest.approx(
             (tifffile.imread(snapped) == TOP).mean(), abs=0.02
         )
         dim = written(tmp_path, 20.0, 25.0)
