@@ -105,7 +105,7 @@ _L = TypeVar("_L", ConnectionLimits, TwinLimits, ViewerLimits)
 
 
 def with_limits(words: Sequence[str], default: _L, others: Collection[str] = ()) -> _L:
-    """`default` with the values of those `NAME=VALUE` words that are its own.
+    """Set limits from `NAME=VALUE` words.
 
     Args:
         words: as on the command line.
@@ -114,6 +114,9 @@ def with_limits(words: Sequence[str], default: _L, others: Collection[str] = ())
 
     Raises:
         AccessError: no such limit, or not a number above zero; says what is allowed.
+
+    Returns:
+        `default` with the values of those words that are its own.
     """
     names: tuple[str, ...] = limit_names(default)
     out: _L = default
@@ -137,12 +140,12 @@ def with_limits(words: Sequence[str], default: _L, others: Collection[str] = ())
 
 
 def limit_names(limits: ConnectionLimits | TwinLimits | ViewerLimits) -> tuple[str, ...]:
-    """Names that `with_limits` takes."""
+    """List the names that `with_limits` takes."""
     return tuple(f.name for f in fields(limits))
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address to listen on can be reached from this machine only."""
+    """Return whether an address to listen on can be reached from this machine only."""
     if host == "localhost":
         return True
     try:
@@ -152,10 +155,12 @@ def is_loopback(host: str) -> bool:
 
 
 def is_rebound(host: str) -> bool:
-    """Whether a request to a loopback port is that of a page whose site's name was rebound to it.
+    """Return whether a request to a loopback port is that of a page whose site's name was
+    rebound to it.
 
-    A page may send requests to its own site without being asked, and its site may say that its name
-    is now 127.0.0.1 (DNS rebinding). Its browser sends that name as the request's Host.
+    A page may send requests to its own site without being asked, and its site may say
+    that its name is now 127.0.0.1 (DNS rebinding). Its browser sends that name as the
+    request's Host.
 
     Args:
         host: the request's Host, with or without a port; "" where there is none.
@@ -182,12 +187,12 @@ def check_bind(host: str, token: str | None) -> None:
 
 
 def token_matches(given: str | None, token: str) -> bool:
-    """Constant-time comparison of a client's token with the server's."""
+    """Compare a client's token with the server's in constant time."""
     return given is not None and hmac.compare_digest(given.encode(), token.encode())
 
 
 def read_token(file: Path | None) -> str | None:
-    """The token: first line of `file`, else the environment's, else None.
+    """Read the token: first line of `file`, else the environment's FLEXDT_TOKEN, else None.
 
     Raises:
         AccessError: the file cannot be read or holds no token.
@@ -206,7 +211,8 @@ def read_token(file: Path | None) -> str | None:
 
 
 def client_tls(authority: Path | None, *, any_name: bool = False) -> ssl.SSLContext | None:
-    """A client's TLS context that trusts the certificates of a PEM file alone; None without one.
+    """Make a client's TLS context that trusts the certificates of a PEM file alone; None
+    without one.
 
     Args:
         authority: the file.
@@ -228,7 +234,7 @@ def client_tls(authority: Path | None, *, any_name: bool = False) -> ssl.SSLCont
 
 
 def server_tls(certificate: Path | None, key: Path | None) -> ssl.SSLContext | None:
-    """A server's TLS context from PEM files; None where none are given.
+    """Make a server's TLS context from PEM files; None if none are given.
 
     Raises:
         AccessError: only one of the two is given, or a file is invalid.

@@ -15,8 +15,8 @@ import sys
 import threading
 import time
 
-GRACE_S = 15.0
-"""How long the module may take to stop after its parent has gone [s]."""
+STOP_GRACE_S = 15.0
+"""Time that the module may take to stop after its parent has gone [s]."""
 
 
 def main() -> None:
@@ -30,10 +30,11 @@ def main() -> None:
 
 
 def _watch() -> None:
+    """Wait until standard input closes, then send SIGTERM, and kill after `STOP_GRACE_S`."""
     while os.read(0, 4096):
         pass
     os.kill(os.getpid(), signal.SIGTERM)
-    time.sleep(GRACE_S)
+    time.sleep(STOP_GRACE_S)
     os._exit(1)
 
 

@@ -27,6 +27,7 @@ MODULE: Final = "flexdt.runtime.compile_ahead"
 
 
 def _detection() -> None:
+    """Compile the kernels of bead detection."""
     from flexdt.twin.calibration.detect import spot_kernels
 
     image, mask = np.zeros((9, 9), np.float32), np.zeros((9, 9), np.uint8)
@@ -36,6 +37,7 @@ def _detection() -> None:
 
 
 def _fit() -> None:
+    """Compile the kernels of calibration, on no views."""
     from flexdt.twin.calibration.fit import fit_kernels
 
     ints, floats, views = np.zeros(1, np.int64), np.zeros(1), np.zeros((0, 1))  # of no view
@@ -52,6 +54,7 @@ def _fit() -> None:
 
 
 def _reconstruction() -> None:
+    """Compile the kernels of FDK, on eight views."""
     from flexdt.twin.reconstruction import fdk
     from flexdt.twin.reconstruction.kernels import fdk_kernels, truncation_kernels
 
@@ -71,12 +74,13 @@ GROUPS: Final[dict[str, tuple[Callable[[], None], str]]] = {
     "bead detection": (_detection, "calibration.detect.spot_kernels:fit_ball"),
     "FDK": (_reconstruction, "reconstruction.kernels.fdk_kernels:warp"),
 }
-"""What compiles it, and the entry point that it compiles last; those that take longest first."""
+"""Group -> what compiles it, and the entry point that it compiles last; the slowest first."""
 ANALYSIS: Final = ("calibration", "bead detection", "FDK")
+"""Groups that the analysis of a data set needs."""
 
 
 def is_compiled(group: str) -> bool:
-    """Whether numba's disk cache holds a group's last entry point for this processor."""
+    """Return whether numba's disk cache holds a group's last entry point for this processor."""
     from importlib import import_module
 
     module, _, name = GROUPS[group][1].partition(":")
@@ -90,7 +94,8 @@ def compile_ahead(groups: Sequence[str], note: Callable[[str], None]) -> None:
 
     Args:
         groups: names, of `GROUPS`.
-        note: told what is compiled, if anything is, when a group is done, and every `SILENT_S`.
+        note: called with a line about what is compiled, when a group is done, and every
+            `SILENT_S`.
     """
     missing = [group for group in groups if not is_compiled(group)]
     if not missing:
@@ -107,13 +112,14 @@ def compile_ahead(groups: Sequence[str], note: Callable[[str], None]) -> None:
 
 
 def elsewhere(group: str) -> None:
-    """Compile a group in a process that ends with this one; what fails is told at its first use."""
+    """Compile a group in a process that ends with this one; failures appear at the first
+    use."""
     with start(["--here", group]) as process:
         process.wait()
 
 
 def start(words: Sequence[str], **streams: Any) -> subprocess.Popen[bytes]:
-    """This module as a process that ends with the one that starts it."""
+    """Start this module as a process that ends with the present one."""
     command = [sys.executable, "-P", "-m", "flexdt.runtime.child", MODULE, *words]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     return subprocess.Popen(command, stdin=subprocess.PIPE, **{**quiet, **streams})

@@ -42,17 +42,19 @@ from flexdt.runtime.process import BACKLOG, ServerLoop, durations
 from flexdt.runtime.process_settings import ServerSettings
 from flexdt.runtime.waiting_room import Room, neighbourhood
 
-SILENT_S: Final = 5.0
-"""A client that sends nothing for so long is left."""
-HELD_S: Final = 60.0
-"""An event loop that gives no page for so long is told as failed (503)."""
+MAX_SILENCE_S: Final = 5.0
+"""Time after which a silent client is disconnected [s]."""
+MAX_HELD_S: Final = 60.0
+"""Time after which an event loop that makes no page counts as failed (503) [s]."""
 STRANGERS: Final = 64
-"""Connections that may wait for the end of their request: where one address opens 167 a second,
-each of them still has 0.4 s for it."""
+"""Largest number of connections that wait for the end of their request.
+
+Where one address opens 167 a second, each of them still has 0.4 s for it.
+"""
 ANSWERED: Final = 16
-"""Requests that may be answered at a time."""
+"""Largest number of requests that are answered at a time."""
 ADMIT: Final = "flexdt.admit"
-"""Key of a request's environment: what to call once it is to be answered."""
+"""Key of a request's environment: function to call before it is answered."""
 OPEN_PAGES: Final = ("/healthz",)
 CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 
@@ -60,7 +62,15 @@ CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 def _figure(
     kind: str, name: str, help: str, values: float | Mapping[str, float], label: str = ""
 ) -> Metric:
-    """A figure: its value, or the values of a label's values."""
+    """Make a figure of the metrics page.
+
+    Args:
+        kind: gauge or counter.
+        name: of the figure.
+        help: one sentence.
+        values: its value, or label value -> value.
+        label: name of the label.
+    """
     metric = Metric(name.removesuffix("_total"), help, kind)
     for what, value in values.items() if isinstance(values, Mapping) else [("", values)]:
         metric.add_sample(name, {label: what} if label else {}, value)
@@ -81,18 +91,18 @@ class Requests:
         self._times = durations("flexdt_request_seconds", what, ["method"])
 
     def observe(self, method: str, seconds: float, code: int | None) -> None:
-        """A request has been answered; `code` of the error, None for a result."""
+        """Count an answered request; `code` of the error, None for a result."""
         self._counts.labels(method, "ok" if code is None else code).inc()
         self._times.labels(method).observe(seconds)
 
     def figures(self) -> list[Metric]:
-        """What has been counted."""
+        """List the counts and durations so far."""
         return [*self._counts.collect(), *self._times.collect()]
 
 
 @dataclass(frozen=True)
 class _Collected:
-    """What `generate_latest` reads; a registry of the library would hold the same and more."""
+    """Adapter that `generate_latest` reads."""
 
     metrics: list[Metric]
 
@@ -101,7 +111,8 @@ class _Collected:
 
 
 def render(figures: Iterable[Metric]) -> str:
-    """The page in Prometheus's text format, with what the library knows of the process."""
+    """Format the page in Prometheus's text format, with the library's figures of the
+    process."""
     process = ProcessCollector(registry=None).collect()
     return generate_latest(_Collected([*figures, *process])).decode()
 
@@ -127,13 +138,13 @@ class _Visitor:
     address: str
 
     def displace(self) -> None:
-        """Wake its thread, which finds the connection closed."""
+        """Close the connection, which wakes its thread."""
         with contextlib.suppress(OSError):
             self.sock.shutdown(socket.SHUT_RDWR)
 
 
 class _Server(ThreadingWSGIServer):
-    """A thread for each connection, of which so many may be as the rooms hold."""
+    """Threading server with a bounded number of connections."""
 
     request_queue_size = BACKLOG
 
@@ -144,7 +155,7 @@ class _Server(ThreadingWSGIServer):
         super().__init__(*given, **more)
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Let a connection in, and start its thread."""
+        """Admit a connection and start its thread."""
         visitor = _Visitor(request, neighbourhood(str(client_address[0])))
         with self._lock:
             self._here[request] = visitor
@@ -152,13 +163,13 @@ class _Server(ThreadingWSGIServer):
         super().process_request(request, client_address)
 
     def admit(self, request: Any) -> None:
-        """Its request is answered."""
+        """Move a connection to those whose request is answered."""
         with self._lock:
             self._strangers.leave(self._here[request])
             self._answered.enter(self._here[request])
 
     def shutdown_request(self, request: Any) -> None:
-        """A connection has ended, or its thread could not be started."""
+        """Remove a connection that has ended, or whose thread could not start."""
         with self._lock:
             visitor = self._here.pop(request)
             self._strangers.leave(visitor)
@@ -166,19 +177,19 @@ class _Server(ThreadingWSGIServer):
         super().shutdown_request(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Log what is not the end of a connection."""
+        """Log an error unless it is the end of a connection."""
         if not isinstance(sys.exc_info()[1], OSError):
             log("http page failed", logging.ERROR, error=True)
 
 
 class _Handler(WSGIRequestHandler):
-    """One connection: a request, and nothing in the log, which holds lines of JSON."""
+    """One connection: a request; its own log lines are suppressed."""
 
-    timeout = SILENT_S
+    timeout = MAX_SILENCE_S
     server: _Server
 
     def get_environ(self) -> dict[str, Any]:
-        """What the application is told, with how it tells that it answers the request."""
+        """Add the function that admits the request to the environment."""
         return {**super().get_environ(), ADMIT: partial(self.server.admit, self.connection)}
 
     def log_message(self, format: str, *args: object) -> None:
@@ -186,6 +197,7 @@ class _Handler(WSGIRequestHandler):
 
 
 def _foreign(host: str) -> bool:
+    """Return whether a request's Host is that of another site, or unreadable."""
     try:
         return is_rebound(host)
     except ValueError:
@@ -193,10 +205,17 @@ def _foreign(host: str) -> bool:
 
 
 def _application(pages: Pages, token: str | None, *, loopback: bool) -> Callable[..., list[bytes]]:
-    """The pages as a WSGI application, made by the loop that runs now."""
+    """Make the pages a WSGI application of the running event loop.
+
+    Args:
+        pages: path -> function that makes the page.
+        token: required beyond `OPEN_PAGES`; None: of nobody.
+        loopback: whether requests of other sites' pages are rejected by their Host.
+    """
     loop = asyncio.get_running_loop()
 
     def response(asked: Mapping[str, Any]) -> HttpResponse:
+        """Check a request and have the loop make its page."""
         path, given = asked["PATH_INFO"], asked.get("HTTP_AUTHORIZATION", "")
         if loopback and "HTTP_HOST" in asked and _foreign(asked["HTTP_HOST"]):
             return HttpResponse("{}", HTTPStatus.FORBIDDEN)
@@ -211,6 +230,7 @@ def _application(pages: Pages, token: str | None, *, loopback: bool) -> Callable
         made: Future[HttpResponse] = Future()
 
         def make() -> None:
+            """Make the page in a turn of the loop."""
             try:
                 made.set_result(pages[path]())
             except Exception as error:
@@ -218,11 +238,12 @@ def _application(pages: Pages, token: str | None, *, loopback: bool) -> Callable
 
         try:
             loop.call_soon_threadsafe(make)
-            return made.result(HELD_S)
+            return made.result(MAX_HELD_S)
         except (TimeoutError, RuntimeError):  # the loop is held, or closed
             return HttpResponse("{}", HTTPStatus.SERVICE_UNAVAILABLE)
 
     def application(asked: dict[str, Any], start: Callable[..., object]) -> list[bytes]:
+        """Answer a request, as WSGI has it."""
         page = response(asked)
         body = page.text.encode()
         head = {"Content-Type": page.content_type, "Content-Length": str(len(body)),
@@ -278,7 +299,7 @@ def watching_pages(
     *,
     failed: Callable[[], bool] = lambda: False,
 ) -> Pages:
-    """The pages of a server that runs.
+    """Make the pages of a running server.
 
     Args:
         health: content of `/healthz` beside its status.
@@ -288,12 +309,14 @@ def watching_pages(
     """
 
     def healthz() -> HttpResponse:
+        """Make `/healthz`: status and the server's facts."""
         dead = failed()
         document = {"status": "failed" if dead else "ok", **health()}
         status = HTTPStatus.SERVICE_UNAVAILABLE if dead else HTTPStatus.OK
         return HttpResponse(json.dumps(document) + "\n", status)
 
     def metrics() -> HttpResponse:
+        """Make `/metrics`: requests, figures, lost log lines and turns of the loop."""
         page = [*(requests or Requests()).figures(), *figures()]
         page.append(
             counter("flexdt_log_dropped_total", "Log lines nobody took in time.", dropped())

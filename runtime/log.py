@@ -28,7 +28,7 @@ _CURRENT: ContextVar[str] = ContextVar("flexdt_trace", default="")
 
 
 def current() -> str:
-    """The id of the current context; an empty string where there is none."""
+    """Return the id of the current context; an empty string if there is none."""
     return _CURRENT.get()
 
 
@@ -43,10 +43,13 @@ def traced(name: str) -> Iterator[None]:
 
 
 BURST = 10
-"""Lines of one kind that are written at once, so that whatever is rare is written whole."""
+"""Number of lines of one kind that are written at once, so that rare ones are all written."""
 EVERY_S = 10.0
-"""After these, one line of the kind in this time [s]: 370 in the first hour, 70 kB of 200 bytes
-each, so that a dozen kinds stay below 1 MB an hour."""
+"""Interval of further lines of the kind [s].
+
+370 lines in the first hour, 70 kB of 200 bytes each, so that a dozen kinds stay below 1
+MB an hour.
+"""
 LOGGER = logging.getLogger("flexdt")
 LIBRARIES = ("py.warnings", "asyncio", "websockets")
 LEVELS = {name.lower(): level for name, level in logging.getLevelNamesMapping().items()}
@@ -56,7 +59,7 @@ class JsonLines(logging.Formatter):
     """Formats a record as one JSON object: time, level, event, facts, and the traceback if any."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """One line of JSON."""
+        """Format a record as one line of JSON."""
         stamp = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created))
         line: dict[str, object] = {
             "time": f"{stamp}.{int(record.msecs):03d}Z",
@@ -70,11 +73,13 @@ class JsonLines(logging.Formatter):
 
 
 class Apart(QueueHandler):
-    """Writes records from a thread of its own, so that a stuck reader of the log stops nobody.
+    """Writes records from a thread of its own, so that a blocked reader of the log blocks
+    nobody.
 
     Args:
         target: formats and writes.
-        room: records kept while the reader is stuck; further ones are dropped and counted.
+        room: records kept while the reader is stuck; further ones are dropped and
+            counted.
     """
 
     def __init__(self, target: logging.Handler, room: int = 10_000) -> None:
@@ -91,14 +96,14 @@ class Apart(QueueHandler):
         return record
 
     def enqueue(self, record: logging.LogRecord) -> None:
-        """Queue one record, or count it where there is no room."""
+        """Queue one record, or count it if there is no room."""
         try:
             self.queue.put_nowait(record)
         except queue.Full:
             self.dropped += 1
 
     def close(self) -> None:
-        """Write what is queued; gives up on a reader that is stuck."""
+        """Write the queued records; a blocked reader is abandoned."""
         self._listener.stop()
         super().close()
 
@@ -107,7 +112,7 @@ class _Listener(QueueListener):
     _thread: threading.Thread | None
 
     def stop(self) -> None:
-        """As the library's, but it does not wait forever for a reader that is stuck."""
+        """Stop like the library's, but without waiting forever for a blocked reader."""
         thread, self._thread = self._thread, None
         if thread is not None:
             with contextlib.suppress(queue.Full):
@@ -116,7 +121,7 @@ class _Listener(QueueListener):
 
 
 def dropped() -> int:
-    """How many records were dropped because nobody read the log."""
+    """Return how many records were dropped because nobody read the log."""
     return sum(h.dropped for h in LOGGER.handlers if isinstance(h, Apart))
 
 
@@ -129,9 +134,10 @@ def log(event: str, level: int = logging.INFO, *, error: bool = False, **facts: 
 
 
 class Sparing:
-    """Writes lines that others cause: the first of each kind, then one now and then.
+    """Limits lines that others cause: the first of each kind, then one at intervals.
 
-    A line that is written after others of its kind were left out says how many (`left_out`).
+    A line that is written after others of its kind were left out says how many
+    (`left_out`).
 
     Args:
         burst: lines of a kind written at once.
@@ -151,7 +157,7 @@ class Sparing:
         error: bool = False,
         **facts: object,
     ) -> None:
-        """Write a line as `log` does, or count it; its kind is the event unless given."""
+        """Write a line like `log`, or count it; its kind is the event unless given."""
         kind, now, burst = kind or event, self._clock(), float(self._burst)
         at, allowed, left_out = self._kinds.get(kind, (now, burst, 0))
         allowed = min(burst, allowed + (now - at) / EVERY_S)

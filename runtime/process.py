@@ -37,18 +37,23 @@ if TYPE_CHECKING:
     from prometheus_client import Histogram
 
 BACKLOG = 1024
-"""Connections that the system keeps until they are accepted. Beyond them it drops a client's first
-packet, which is sent again after a whole second: six seconds of 10 000 connections a minute fit."""
+"""Number of connections that the system keeps until they are accepted.
+
+Beyond them it drops a client's first packet, which is sent again after a whole second:
+six seconds of 10 000 connections a minute fit.
+"""
 TLS_HANDSHAKE_S = 10.0
+"""Time limit of a TLS handshake [s]."""
 
 
-MOST_DESCRIPTORS: Final = 1 << 16
-"""Descriptors that a server asks the system for, where more are allowed."""
+MAX_DESCRIPTORS: Final = 1 << 16
+"""Number of descriptors that a server requests, if so many are allowed."""
 BUCKETS_S = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.25, 1.0, 5.0)
+"""Upper bounds of the histograms' bins [s]."""
 
 
 def durations(name: str, help: str, labels: Sequence[str] = ()) -> Histogram:
-    """A histogram of durations [s], for the page of figures."""
+    """Make a histogram of durations [s] for the metrics page."""
     from prometheus_client import Histogram, disable_created_metrics
 
     disable_created_metrics()  # type: ignore[no-untyped-call]
@@ -56,20 +61,20 @@ def durations(name: str, help: str, labels: Sequence[str] = ()) -> Histogram:
 
 
 class Holds:
-    """How long turns of the loop took [s]."""
+    """Durations of the loop's turns [s]."""
 
     def __init__(self) -> None:
         self.begin()
 
     def begin(self) -> None:
-        """Start counting anew."""
+        """Reset the counts."""
         what = "How long each turn held the event loop."
         self.turns = durations("flexdt_loop_hold_seconds", what)
         self._worst = 0.0
         self._begun = False
 
     def observe(self, seconds: float) -> None:
-        """A turn has ended; the one in which counting began does not count."""
+        """Count a turn that has ended, except the one in which counting began."""
         if not self._begun:
             self._begun = True
             return
@@ -77,7 +82,7 @@ class Holds:
         self._worst = max(self._worst, seconds)
 
     def worst(self) -> float:
-        """The longest since the last call; reading it resets it."""
+        """Return the longest turn since the last call, and reset it."""
         worst, self._worst = self._worst, 0.0
         return worst
 
@@ -114,6 +119,7 @@ class ServerLoop(asyncio.SelectorEventLoop):
         lines = Sparing(burst=1)
 
         def complain(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+            """Log what asyncio reports; errors of the system without a traceback."""
             what, error = str(context.get("message")), context.get("exception")
             kind = f"{what} {type(error).__name__}"
             if error is None or isinstance(error, OSError):
@@ -129,13 +135,13 @@ class ServerLoop(asyncio.SelectorEventLoop):
 
 
 class ListeningServer:
-    """A server that listens; `port` holds once it does."""
+    """A server that listens; `port` is valid once it does."""
 
     server: asyncio.Server | None = None
 
     @property
     def port(self) -> int:
-        """The port it listens on."""
+        """Port it listens on."""
         assert self.server is not None
         return int(self.server.sockets[0].getsockname()[1])
 
@@ -166,44 +172,45 @@ class ListeningServer:
         one_at_a_time(self.server)
 
     async def serve(self) -> None:
-        """Take the connections that `listen` let wait."""
+        """Accept the connections that `listen` let wait."""
         assert self.server is not None
         await self.server.start_serving()
         one_at_a_time(self.server)
 
 
 def one_at_a_time(server: asyncio.Server) -> None:
-    """For a server made with `backlog=1`: let the system keep as many connections as usual.
+    """Set the system's usual backlog for a server made with `backlog=1`.
 
-    asyncio tries to accept `backlog` connections in one go, and when descriptors run out it
-    schedules a new attempt for each that failed, so that attempts multiply a hundredfold every
-    second. With one at a time there is a single attempt. New connections also alternate with
-    requests that way.
+    asyncio tries to accept `backlog` connections in one go, and when descriptors run out
+    it schedules a new attempt for each that failed, so that attempts multiply a
+    hundredfold every second. With one at a time there is a single attempt. New
+    connections also alternate with requests that way.
     """
     for listening in server.sockets:
         with listening.dup() as same:
             same.listen(BACKLOG)
 
 
-IDLE_S: Final = 30
+KEEP_ALIVE_AFTER_S: Final = 30
+"""Silence before the first keep-alive probe [s]."""
 
 
 def tune(sock: socket.socket | None) -> None:
-    """No Nagle delay; keep-alive probes after 30 s of silence, given up after three of them.
+    """Disable Nagle's delay; send keep-alive probes after 30 s of silence, three at most.
 
-    A peer whose machine or network has died is thus gone after a minute instead of two hours, and
-    with it whatever it held (control of the twin, memory of an upload). Harmless on sockets that
-    are not TCP, and where the platform lacks an option.
+    A peer whose machine or network has died is thus gone after a minute instead of two
+    hours, and with it whatever it held (control of the twin, memory of an upload).
+    Harmless on sockets that are not TCP, and where the platform lacks an option.
     """
     if sock is None or sock.family not in (socket.AF_INET, socket.AF_INET6):
         return
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for name, value in (
-        ("TCP_KEEPIDLE", IDLE_S),
-        ("TCP_KEEPINTVL", IDLE_S // 3),
+        ("TCP_KEEPIDLE", KEEP_ALIVE_AFTER_S),
+        ("TCP_KEEPINTVL", KEEP_ALIVE_AFTER_S // 3),
         ("TCP_KEEPCNT", 3),
-        ("TCP_USER_TIMEOUT", 2000 * IDLE_S),
+        ("TCP_USER_TIMEOUT", 2000 * KEEP_ALIVE_AFTER_S),
     ):
         option = getattr(socket, name, None)
         if option is not None:
@@ -216,7 +223,7 @@ FAILED = 1
 USAGE = 2
 REFUSED = 4
 SUPERVISED = "FLEXDT_SUPERVISED"
-"""In the environment of a supervisor's processes."""
+"""Environment variable of a supervisor's processes."""
 SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 S = TypeVar("S", bound=ProcessSettings)
@@ -224,7 +231,8 @@ T = TypeVar("T")
 
 
 def stop_signal() -> asyncio.Event:
-    """An event set by SIGTERM or SIGINT; a second signal does not interrupt the stopping."""
+    """Make an event that SIGTERM or SIGINT sets; a second signal does not interrupt the
+    stopping."""
     stop, loop = asyncio.Event(), asyncio.get_running_loop()
     for number in SIGNALS:
         loop.add_signal_handler(number, stop.set)
@@ -242,7 +250,8 @@ async def first_of(*events: asyncio.Event) -> None:
 
 
 def announce(server: str, facts: Mapping[str, object], out: TextIO | None = None) -> None:
-    """Print the one JSON line that says the server is ready, with its process's id."""
+    """Print the JSON line that says the server is ready, with its process id; freeze
+    garbage collection."""
     loop = asyncio.get_running_loop()
     if isinstance(loop, ServerLoop):
         # What is there now stays: looking through it for garbage would take 0.1 s each time.
@@ -253,17 +262,20 @@ def announce(server: str, facts: Mapping[str, object], out: TextIO | None = None
 
 
 def announce_bound(server: str, host: str, port: int) -> None:
-    """For a supervisor, which starts others meanwhile: a line with the address before `ready`."""
+    """Print the address before `ready`, for a supervisor, which starts others meanwhile."""
     if SUPERVISED in os.environ:
         print(json.dumps({"bound": server, "host": host, "port": port}), flush=True)
 
 
 def run_process(settings: S, run: Callable[[S], Coroutine[None, None, int]]) -> int:
-    """Run the work to its end; returns the exit code, with the error on standard error if any.
+    """Run the work to its end; print an error on standard error.
 
     Args:
         settings: of the process; `host` and `port` are where it listens.
         run: the work; returns its own exit code.
+
+    Returns:
+        Exit code.
     """
     _allow_descriptors()
     try:
@@ -284,19 +296,19 @@ def run_process(settings: S, run: Callable[[S], Coroutine[None, None, int]]) -> 
 
 
 def _allow_descriptors() -> None:
-    """Have as many descriptors as this process may: the usual 1024 are fewer than the places."""
+    """Raise the limit on descriptors: the usual 1024 are fewer than the places for clients."""
     try:
         import resource
     except ImportError:  # Windows has no such limit
         return
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    most = MOST_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, MOST_DESCRIPTORS)
+    most = MAX_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, MAX_DESCRIPTORS)
     with contextlib.suppress(OSError, ValueError):  # macOS allows fewer than it says
         resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, most), hard))
 
 
 def read_if_there(file: Path | None, parse: Callable[[str, str], T]) -> T | None:
-    """A machine's or profile's file as `parse` reads it; None where there is no such file.
+    """Read and parse a machine's or profile's file; None if there is no such file.
 
     Args:
         file: to read.
@@ -308,17 +320,18 @@ def read_if_there(file: Path | None, parse: Callable[[str, str], T]) -> T | None
 
 
 def process_seconds(pid: int) -> float | None:
-    """Processor time of a process so far, with the children that it has seen end [s].
+    """Return the processor time of a process so far, with its children that have ended [s].
 
-    A busy machine gives a process less of its processors, not less to do: what bounds work is the
-    time that the work itself has used. None where the system does not tell.
+    A busy machine gives a process less of its processors, not less to do: what bounds
+    work is the time that the work itself has used. None where the system does not tell.
     """
     words = _words(str(pid))
     return _seconds(words) if words else None
 
 
 def session_seconds(session: int) -> float | None:
-    """Processor time of the processes of a session so far [s]; None as `process_seconds`.
+    """Sum up the processor time of the processes of a session so far [s]; None as
+    `process_seconds`.
 
     Args:
         session: its number, which is the process id of its first process.
@@ -332,7 +345,7 @@ def session_seconds(session: int) -> float | None:
 
 
 def _words(pid: str) -> list[str]:
-    """The words of a process's line after its name; none of one that has ended meanwhile."""
+    """Return the fields of a process's line after its name; none for one that has ended."""
     try:
         with open(f"/proc/{pid}/stat", encoding="utf-8", errors="replace") as file:
             return file.read().rpartition(")")[2].split()
@@ -341,4 +354,5 @@ def _words(pid: str) -> list[str]:
 
 
 def _seconds(words: list[str]) -> float:
+    """Sum up the processor times of a process's fields [s]."""
     return sum(int(word) for word in words[11:15]) / os.sysconf("SC_CLK_TCK")

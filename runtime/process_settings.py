@@ -22,8 +22,8 @@ TWIN_PORT: Final = 55000
 PROJECTOR_PORT: Final = 55001
 VIEWER_PORT: Final = 8080
 GATEWAY_PORT: Final = 50000
-LARGEST_PORT: Final = 65535
-UNITS: Final = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
+MAX_PORT: Final = 65535
+BYTES_OF_UNIT: Final = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
 """Prefix of a unit -> bytes."""
 LogLevel = Literal["debug", "info", "warning", "error"]
 Physics = Literal["ideal", "mono", "poly"]
@@ -42,7 +42,7 @@ class Address:
 
 
 def address(text: str) -> Address:
-    """Read HOST:PORT or [IPv6]:PORT.
+    """Parse HOST:PORT or [IPv6]:PORT.
 
     Raises:
         typer.BadParameter: the text has another form, or the port is none.
@@ -51,13 +51,13 @@ def address(text: str) -> Address:
     closed = host.startswith("[") == host.endswith("]")
     if not host or not closed or not (port.isascii() and port.isdigit()):
         raise typer.BadParameter(f"{text!r} is not HOST:PORT, such as {LOOPBACK}:{TWIN_PORT}")
-    if not 1 <= int(port) <= LARGEST_PORT:
-        raise typer.BadParameter(f"{text!r}: the port must be a number from 1 to {LARGEST_PORT}")
+    if not 1 <= int(port) <= MAX_PORT:
+        raise typer.BadParameter(f"{text!r}: the port must be a number from 1 to {MAX_PORT}")
     return Address(host.strip("[]"), int(port))
 
 
 def addresses(text: str | None) -> tuple[Address, ...]:
-    """Read HOST:PORT,HOST:PORT...; none of None.
+    """Parse HOST:PORT,HOST:PORT...; none of None.
 
     Raises:
         typer.BadParameter: as `address`.
@@ -66,26 +66,26 @@ def addresses(text: str | None) -> tuple[Address, ...]:
 
 
 def several(text: str) -> str:
-    """The same text, once `addresses` has read it; errors as there."""
+    """Check a text by `addresses` and return it unchanged."""
     addresses(text)
     return text
 
 
 def memory_size(text: str) -> int:
-    """Bytes of "4GiB", "512M" or "1000000".
+    """Parse "4GiB", "512M" or "1000000" [bytes].
 
     Raises:
         typer.BadParameter: not a size.
     """
     match = re.fullmatch(r"(\d+\.?\d*)\s*([kmgt]?)i?b?", text.strip().lower())
-    size = 0 if match is None else int(float(match[1]) * UNITS[match[2]])
+    size = 0 if match is None else int(float(match[1]) * BYTES_OF_UNIT[match[2]])
     if size <= 0:
         raise typer.BadParameter(f"{text!r} is not a size such as 512M or 4GiB")
     return size
 
 
 def speed_up(text: str | float) -> float | Literal["max"]:
-    """Read how many times as fast as yours the twin's time runs: a positive number, or max.
+    """Parse the speed-up of the twin's time: a positive number, or max.
 
     Raises:
         typer.BadParameter: neither.
@@ -103,7 +103,7 @@ def speed_up(text: str | float) -> float | Literal["max"]:
 
 
 def scatter_method(text: str) -> str:
-    """Read a method of simulating scatter: off or mc.
+    """Parse a method of simulating scatter: off or mc.
 
     Raises:
         typer.BadParameter: another one.
@@ -114,10 +114,8 @@ def scatter_method(text: str) -> str:
     return text
 
 
-def tcp_port(
-    default: int | None, *flags: str, most: int = LARGEST_PORT, public: bool = True
-) -> Any:
-    """A field for a TCP port."""
+def tcp_port(default: int | None, *flags: str, most: int = MAX_PORT, public: bool = True) -> Any:
+    """Declare a field for a TCP port."""
     return option(default, *flags, public=public, min=0, max=most)
 
 
@@ -240,7 +238,7 @@ class TwinSettings(FarProjectorSettings, ScannerSettings):
 
     @property
     def places(self) -> tuple[Address, ...]:
-        """Where the projectors listen, each once."""
+        """Addresses of the projectors, each once."""
         port = None if self.projector_port is None else Address(LOOPBACK, self.projector_port)
         named = [place for place in (self.projector or port,) if place is not None]
         found = tuple(dict.fromkeys((*named, *addresses(self.projectors))))
@@ -319,4 +317,4 @@ class UpSettings(FarProjectorSettings, ScannerSettings):
     projector_memory: str | None = option(None, public=False, metavar="SIZE")
     viewer_port: int = tcp_port(VIEWER_PORT)
     no_viewer: bool = option(False)
-    gateway_port: int | None = tcp_port(None, most=LARGEST_PORT - 1)
+    gateway_port: int | None = tcp_port(None, most=MAX_PORT - 1)

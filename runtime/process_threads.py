@@ -22,17 +22,19 @@ from flexdt.twin import kernel_threads
 OPENMP: Final = "libgomp.so.1"
 """GNU OpenMP as numba's layer names it."""
 SLEEPING: Final[Mapping[str, str]] = {"OMP_WAIT_POLICY": "passive"}
-"""What OpenMP reads when it is loaded: waiting threads sleep."""
+"""Environment that OpenMP reads when it is loaded: waiting threads sleep."""
 CHOSEN_BY: Final = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")
-"""Variables of the environment by which users choose how OpenMP's threads wait."""
+"""Environment variables by which users choose how OpenMP's threads wait."""
 LAYER: Final = "numba.np.ufunc.parallel"
 DEVICE: Final = "flexdt.twin.projection.gpu"
 
 
 def load_sleeping() -> str:
-    """Load OpenMP with threads that sleep while they wait, unless the user chose or it is loaded.
+    """Load OpenMP with threads that sleep while they wait, unless the user chose or it is
+    loaded.
 
-    The environment is then as it was: other libraries and child processes keep their defaults.
+    The environment is then as it was: other libraries and child processes keep their
+    defaults.
 
     Returns:
         How its threads wait.
@@ -55,7 +57,8 @@ def load_sleeping() -> str:
 
 
 def _in_child() -> None:
-    """Compute in one thread if the parent had kernel threads, and without the parent's device."""
+    """Restrict a forked child to one thread if the parent had kernel threads, and to no
+    device."""
     gpu = sys.modules.get(DEVICE)
     if gpu is not None:
         gpu.leave_after_fork()
@@ -65,7 +68,7 @@ def _in_child() -> None:
 
 
 def watch() -> None:
-    """Decide for this process and its forked children."""
+    """Set how kernel threads wait in this process, and restrict its forked children."""
     if sys.platform == "linux":
         kernel_threads.waiting = load_sleeping()
     if hasattr(os, "register_at_fork"):

@@ -9,18 +9,21 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 SILENT_S = 2.0
+"""Interval of progress lines [s]."""
 _last = [0.0, 0.0]
-"""When the newest line was told and the newest work ended: one kernel compiles after another."""
+"""Times of the newest line and of the end of the newest work [s]: kernels compile one by
+one."""
 
 
 @contextmanager
 def told(what: str) -> Iterator[None]:
-    """Tell the log, and so standard error, of work that goes on inside."""
+    """Report work inside that takes long, to the log and so to standard error."""
     done, begun = threading.Event(), time.monotonic()
     if begun > _last[1] + SILENT_S:
         _last[0] = begun
 
     def tell() -> None:
+        """Log a line every `SILENT_S` until the work is done."""
         while not done.wait(max(0.0, _last[0] + SILENT_S - time.monotonic())):
             _last[0] = time.monotonic()
             logging.getLogger("flexdt.kernels").warning(

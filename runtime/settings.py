@@ -33,7 +33,8 @@ S = TypeVar("S", bound=Settings)
 
 
 def option(default: object, *flags: str, public: bool = True, **details: Any) -> Any:
-    """A field of settings that is an option; its help is what the class's docstring says of it.
+    """Declare a field of settings that is an option; its help is what the class's
+    docstring says of it.
 
     Args:
         default: where the option is left out.
@@ -45,7 +46,7 @@ def option(default: object, *flags: str, public: bool = True, **details: Any) ->
 
 
 def parameters(settings: type[Settings]) -> dict[str, inspect.Parameter]:
-    """A table's keys as options: parameters of a function that typer reads."""
+    """Convert a table's keys to options: parameters of a function that typer reads."""
     hints, found = get_type_hints(settings), {}
     helps = {n: h for kind in settings.__mro__[::-1] for n, h in described(kind)[1].items()}
     for f in fields(settings):
@@ -62,26 +63,26 @@ def parameters(settings: type[Settings]) -> dict[str, inspect.Parameter]:
 
 
 def _is_read(declared: Field[Any]) -> bool:
-    """Whether a parser reads the default, as it reads words; None is left alone."""
+    """Return whether a parser reads the default, as it reads words; None is left alone."""
     return "parser" in declared.metadata["details"] and declared.default is not None
 
 
 def described(thing: object) -> tuple[str, dict[str, str]]:
-    """A docstring without its list of arguments or attributes, and what the list says of each."""
+    """Split a docstring into its text and its arguments or attributes by name."""
     text, *lists = re.split(r"\n\n(?:Args|Attributes):\n", inspect.getdoc(thing) or "")
     items = re.findall(r"^    (\w+): (.*(?:\n {5,}.*)*)", "\n".join(lists), re.MULTILINE)
     return text, {name: " ".join(about.split()) for name, about in items}
 
 
 def has_parameters(command: Callable[..., Any], shown: Iterable[inspect.Parameter]) -> None:
-    """Have typer see these parameters as those of a command, by name alone."""
+    """Set the signature of a command to these parameters, for typer."""
     named = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in shown]
     command.__signature__ = inspect.Signature(named)  # type: ignore[attr-defined]
     command.__annotations__ = {p.name: p.annotation for p in named}
 
 
 def read(settings: type[S], words: Sequence[str] | None = None) -> S | None:
-    """The settings that words say; None where they asked for the help, which is shown.
+    """Read settings from words; None if they asked for the help, which is shown.
 
     Args:
         settings: class of the process or command.
@@ -93,6 +94,7 @@ def read(settings: type[S], words: Sequence[str] | None = None) -> S | None:
     found: dict[str, Any] = {}
 
     def take(**given: Any) -> None:
+        """Store what typer has read."""
         found.update({n: tuple(v) if isinstance(v, list) else v for n, v in given.items()})
 
     has_parameters(take, parameters(settings).values())
@@ -103,7 +105,8 @@ def read(settings: type[S], words: Sequence[str] | None = None) -> S | None:
 
 
 def parse(settings: type[S], words: Sequence[str] | None = None) -> S:
-    """As `read`, in a process of its own: exits with code 2 where the words are wrong."""
+    """Read like `read`, in a process of its own: exit with code 2 for wrong words, 0
+    after the help."""
     try:
         found = read(settings, words)
     except Exception as error:
@@ -117,11 +120,11 @@ def parse(settings: type[S], words: Sequence[str] | None = None) -> S:
 
 
 def words(given: Mapping[str, object]) -> list[str]:
-    """Options as words of a command line.
+    """Convert options to words of a command line.
 
     Args:
-        given: name -> value; None and False are left out, True is a bare flag, a list or tuple is
-            given once for each item.
+        given: name -> value; None and False are left out, True is a bare flag, a list or
+            tuple is given once for each item.
     """
     out = []
     for name, value in given.items():
@@ -135,6 +138,7 @@ def words(given: Mapping[str, object]) -> list[str]:
 
 
 def shared(settings: Settings, other: type[Settings]) -> dict[str, object]:
-    """The values of `settings` that a process with settings `other` takes too, by name."""
+    """Return the values of `settings` that a process with settings `other` takes too, by
+    name."""
     mine = {f.name for f in fields(settings)}
     return {f.name: getattr(settings, f.name) for f in fields(other) if f.name in mine}

@@ -28,19 +28,20 @@ from flexdt.runtime.process import SUPERVISED, session_seconds, stop_signal
 from flexdt.runtime.process_settings import Address
 
 STALLED_S = 300.0
-"""A service that is not ready and has used no processor time for so long waits for something that
-will not come."""
+"""Time without processor use after which a service that is not ready is ended [s]."""
 SILENT_S = 2.0
-"""As often, somebody who waits is told for what, and how much work the start has done so far."""
+"""Interval of progress lines about a start, with its processor time so far [s]."""
 STOP_GRACE_S = 10.0
 FIRST_PAUSE_S = 0.5
-"""Between the second end in a row and the next start; it doubles from there."""
+"""Pause between the second end in a row and the next start [s]; it doubles from there."""
 LONGEST_PAUSE_S = 30.0
-LOOK_S = 0.2
+"""Longest such pause [s]."""
+CHECK_INTERVAL_S = 0.2
+"""Interval at which processes are checked [s]."""
 STEADY_S = 10.0
-"""A service that was ready for so long begins anew: it is started again at once."""
-TOLD_SINGLY = 5
-"""Ends in a row that are told one by one; from there on, those that double their number."""
+"""Time ready after which an end begins a new row: the service starts again at once [s]."""
+MAX_SINGLE_REPORTS = 5
+"""Number of ends in a row that are each reported; after that, those that double it."""
 
 
 Addresses = Mapping[str, Address]
@@ -80,7 +81,7 @@ class Ends:
     row: int = 0
 
     def after(self, steady_s: float) -> float:
-        """Count an end; how long to pause before the next start [s].
+        """Count an end; return the pause before the next start [s].
 
         Args:
             steady_s: for how long the service had been ready.
@@ -92,8 +93,8 @@ class Ends:
 
     @property
     def told(self) -> bool:
-        """Whether the last one is worth a line."""
-        return self.row <= TOLD_SINGLY or self.row & (self.row - 1) == 0
+        """Whether the last end is reported."""
+        return self.row <= MAX_SINGLE_REPORTS or self.row & (self.row - 1) == 0
 
 
 @dataclass
@@ -132,6 +133,7 @@ class Supervisor:
             await self._stop_all()
 
     async def _look_after(self) -> None:
+        """Start all services, announce their addresses, and keep them alive."""
         keepers: list[asyncio.Task[None]] = []
         try:
             starts = [_Start(service) for service in self.services]
@@ -148,7 +150,7 @@ class Supervisor:
             await asyncio.gather(*keepers, return_exceptions=True)
 
     async def _keep(self, start: _Start) -> None:
-        """Start a service, wait for its end, and again.
+        """Start a service whenever it ends.
 
         Raises:
             ServiceError: it left by itself at its first start.
@@ -173,13 +175,15 @@ class Supervisor:
             self._bury(service)
             pause = ends.after(0.0 if begun is None else clock() - begun)
             if ends.told:
-                times = f" for the {ends.row}th time in a row" if ends.row > TOLD_SINGLY else ""
+                times = (
+                    f" for the {ends.row}th time in a row" if ends.row > MAX_SINGLE_REPORTS else ""
+                )
                 later = f" in {pause:g} s" if pause else ""
                 self.note(f"the {service.name} ended ({how}){times}; starting it again{later}")
             await asyncio.sleep(pause)
 
     async def _spawn(self, service: Service) -> Process:
-        """Raises `_Ended` where the system has no room for another process."""
+        """Start a service's process; raise `_Ended` if the system has no room for it."""
         try:
             process = await asyncio.create_subprocess_exec(
                 sys.executable,
@@ -198,7 +202,7 @@ class Supervisor:
         return process
 
     async def _ready(self, process: Process, start: _Start) -> None:
-        """Until it answers; says what is waited for, and later how far it has come.
+        """Wait until a service is ready; report what is waited for and how far it has come.
 
         Raises:
             _Ended: before it said so, or it no longer does anything.
@@ -221,7 +225,9 @@ class Supervisor:
                     )
                     self.note(note or work)
                     note, note_at = "", clock() + SILENT_S
-                await asyncio.wait({ready, end}, timeout=LOOK_S, return_when=FIRST_COMPLETED)
+                await asyncio.wait(
+                    {ready, end}, timeout=CHECK_INTERVAL_S, return_when=FIRST_COMPLETED
+                )
             if ready.done():
                 return ready.result()
             raise _Ended(_how(end.result()), end.result())
@@ -231,7 +237,7 @@ class Supervisor:
             await asyncio.gather(ready, end, return_exceptions=True)
 
     async def _lines(self, process: Process, start: _Start) -> None:
-        """Take the address from the `bound` and `ready` lines, up to `ready`; pass over others."""
+        """Read the address from the `bound` and `ready` lines, up to `ready`; skip others."""
         assert process.stdout is not None
         name = start.service.name
         while True:
@@ -249,13 +255,14 @@ class Supervisor:
                         return
 
     def _bury(self, service: Service) -> None:
-        """End what is left of a service: processes it started may hold its port or its files."""
+        """Kill the rest of a service's session: its children may hold its port or its files."""
         process = self._running.pop(service.name, None)
         if process is not None:
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 os.killpg(process.pid, signal.SIGKILL)
 
     async def _stop_all(self) -> None:
+        """Stop all services in reverse order; kill one that does not stop."""
         for service in reversed(self.services):
             process = self._running.get(service.name)
             if process is not None and process.returncode is None:
@@ -290,7 +297,7 @@ class _Start:
 
 
 async def _unless_one_ends(event: asyncio.Event, keepers: Sequence[asyncio.Task[None]]) -> None:
-    """Wait for an event; a keeper's error ends the waiting."""
+    """Wait for an event; a keeper's error ends the waiting and is raised."""
     waiting = asyncio.create_task(event.wait())
     await asyncio.wait({waiting, *keepers}, return_when=FIRST_COMPLETED)
     waiting.cancel()
@@ -300,7 +307,8 @@ async def _unless_one_ends(event: asyncio.Event, keepers: Sequence[asyncio.Task[
 
 
 async def _drained(process: Process) -> int:
-    """Keep the pipe empty, so that a service that prints can never block; its code at its end."""
+    """Read the pipe until the process ends, so that printing never blocks; return its
+    exit code."""
     drain = asyncio.create_task(_drain(process))
     try:
         return await _ended(process)
@@ -310,23 +318,26 @@ async def _drained(process: Process) -> int:
 
 
 async def _drain(process: Process) -> None:
+    """Read and discard standard output."""
     assert process.stdout is not None
     while await process.stdout.read(65536):
         pass
 
 
 async def _ended(process: Process) -> int:
-    """The code of a process at its end; `Process.wait` waits for all who inherited its pipes."""
+    """Wait for the end of a process alone, not of those who inherited its pipes; return
+    its exit code."""
     end = asyncio.create_task(process.wait())
     try:
         while process.returncode is None:
-            await asyncio.wait({end}, timeout=LOOK_S)
+            await asyncio.wait({end}, timeout=CHECK_INTERVAL_S)
     finally:
         end.cancel()
     return process.returncode
 
 
 def _how(code: int) -> str:
+    """Describe an exit code."""
     if code >= 0:
         return f"exit code {code}"
     try:

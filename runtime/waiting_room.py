@@ -12,8 +12,10 @@ from collections import Counter
 from typing import Final, Generic, Protocol, TypeVar
 
 WAITING: Final = 512
-"""Connections of a port that may wait: where one address opens 167 a second, each of them still has
-3 s to say what it is."""
+"""Largest number of connections of a port that wait.
+
+Where one address opens 167 a second, each of them still has 3 s to say what it is.
+"""
 
 
 class Guest(Protocol):
@@ -44,7 +46,7 @@ class Room(Generic[_G]):
         self.guests: dict[_G, None] = {}
 
     def enter(self, guest: _G) -> None:
-        """Let a connection in; displaces another one if need be."""
+        """Admit a connection; displace another one if the room is full."""
         self.guests[guest] = None
         if len(self.guests) > self._most:
             [(crowd, _)] = Counter(g.address for g in self.guests).most_common(1)
@@ -53,12 +55,13 @@ class Room(Generic[_G]):
             oldest.displace()
 
     def leave(self, guest: _G) -> None:
-        """A connection has a place now, or has ended; it need not be here."""
+        """Remove a connection that has a place now, or has ended; it need not be here."""
         self.guests.pop(guest, None)
 
 
 def neighbourhood(host: str) -> str:
-    """The address for a share: an IPv4 address, or the 64 bits of an IPv6 network (one owner's)."""
+    """Return the address for a share: an IPv4 address, or the 64 bits of an IPv6 network
+    (one owner's)."""
     try:
         address = ipaddress.ip_address(host.partition("%")[0])
     except ValueError:

@@ -34,8 +34,8 @@ CODES: Sequence[tuple[type[e.TwinError], Code]] = (
 
 
 def explain(error: Exception, root: Path | None = None) -> RpcError:
-    """The wire's error for `error`; of files below `root`, the data directory, it says where they
-    are in it."""
+    """Convert `error` to the wire's error; paths below `root`, the data directory, become
+    relative to it."""
     if root is not None:
         known = explain(error)
         message, data = from_root(known.message, root), from_root(known.data, root)
@@ -57,12 +57,12 @@ def explain(error: Exception, root: Path | None = None) -> RpcError:
 
 
 def is_user_error(error: Exception) -> bool:
-    """Whether `explain` has more to say than "internal error"."""
+    """Return whether `explain` gives more than "internal error"."""
     return isinstance(error, RpcError | e.TwinError | ProjectorUnavailable)
 
 
 def from_root(said: object, root: Path) -> object:
-    """What is said, with paths below the folder `root` told from there: no client needs more."""
+    """Replace paths below the folder `root` in nested values by relative ones."""
     match said:
         case str():
             below = said.replace(str(root) + os.sep, "")

@@ -26,6 +26,7 @@ Parts = Sequence[bytes | bytearray | memoryview]
 Work = Callable[..., list[bytes]]
 """A piece of work: a function of a module."""
 NICENESS = 5
+"""Niceness of a worker process."""
 
 
 def send_parts(channel: socket.socket, parts: Parts) -> None:
@@ -59,7 +60,7 @@ def _exactly(channel: socket.socket, size: int) -> bytearray:
 
 
 def limit(what: str, most: int) -> None:
-    """Bound one resource of this process."""
+    """Limit one resource of this process."""
     number = getattr(resource, what)
     hard = resource.getrlimit(number)[1]
     value = most if hard == resource.RLIM_INFINITY else min(most, hard)
@@ -67,9 +68,10 @@ def limit(what: str, most: int) -> None:
 
 
 def peak_bytes() -> int:
-    """Most memory this process has taken so far.
+    """Return the largest memory this process has taken so far [bytes].
 
-    Where Linux tells it: `ru_maxrss` begins with what the process had that started this one.
+    Where Linux tells it: `ru_maxrss` begins with what the process had that started this
+    one.
     """
     try:
         with open("/proc/self/status", encoding="ascii") as status:
@@ -79,7 +81,7 @@ def peak_bytes() -> int:
 
 
 def answer(request: Sequence[bytes]) -> list[bytes]:
-    """Do one piece of work; the first part says how it went."""
+    """Do one piece of work; return its parts after b"done", or how it failed."""
     seconds, call, *raw = request
     # Before the call is read, which imports what it needs.
     limit("RLIMIT_CPU", int(sum(os.times()[:2]) + float(seconds) + 2.0))
@@ -98,9 +100,10 @@ def answer(request: Sequence[bytes]) -> list[bytes]:
 
 
 def document(read: Callable[..., Any], how: Mapping[str, str], raw: bytes) -> list[bytes]:
-    """In the worker: what `read` makes of a stranger's bytes, as JSON; no file may be written.
+    """Read untrusted bytes by `read` in the worker, and return JSON; no file may be written.
 
-    Here, and not beside the server's store, so that the process loads only what `read` needs.
+    Here, and not beside the server's store, so that the process loads only what `read`
+    needs.
     """
     limit("RLIMIT_FSIZE", 0)
     return [json.dumps(read(raw, **how).to_dict()).encode()]
@@ -122,6 +125,7 @@ def main() -> int:
 
 
 def _end_with_parent(number: int) -> None:
+    """Wait until the parent closes the socket, then exit."""
     if not hasattr(select, "POLLRDHUP"):
         return
     watch = select.poll()

@@ -24,13 +24,14 @@ from flexdt.protocol.rpc_errors import Code, RpcError, busy, too_large
 from flexdt.runtime.process import process_seconds
 from flexdt.runtime.worker import Parts, Work, receive_parts, send_parts
 
-KEPT_BYTES = 400 << 20
-"""A process that has taken more is replaced, so that the memory is given back."""
-IDLE_S = 120.0
-"""How long a process without work is kept."""
-LOOK_S = 0.2
-"""How often the processor time of a process at work is looked at."""
+MAX_KEPT_BYTES = 400 << 20
+"""Memory above which a process is replaced, so that it is given back [bytes]."""
+MAX_IDLE_S = 120.0
+"""Time for which a process without work is kept [s]."""
+CHECK_INTERVAL_S = 0.2
+"""Interval at which the processor time of a working process is checked [s]."""
 ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+"""Environment that restricts numerical libraries to one thread."""
 
 
 class Worker:
@@ -65,23 +66,24 @@ class Worker:
 
     @property
     def pid(self) -> int:
-        """The process."""
+        """Process id."""
         return self._process.pid
 
     def ask(
         self, work: Work, arguments: Sequence[object], raw: Parts, seconds: float
     ) -> list[bytes]:
-        """Have one piece of work done; work that fails, or took much memory, ends the process.
+        """Have one piece of work done; a failure, or much memory, ends the process.
 
         Args:
             work: called there.
             arguments: that it takes first, pickled.
             raw: that it takes after them, sent as they are.
-            seconds: of processor time that it may take; doing nothing for so long ends it, too.
+            seconds: of processor time that it may take; doing nothing for so long ends
+                it, too.
 
         Raises:
-            RpcError: the work's own refusal; -32008 where it takes too long, too much memory, or
-                ends its process.
+            RpcError: the work's own refusal; -32008 where it takes too long, too much
+                memory, or ends its process.
             RuntimeError: a fault of ours, with its traceback.
         """
         sound = False
@@ -91,7 +93,7 @@ class Worker:
             send_parts(self._channel, [f"{seconds}".encode(), call, *raw])
             self._wait(seconds)
             how, peak, *answer = receive_parts(self._channel)
-            sound = how in (b"done", b"refused") and int(peak) <= KEPT_BYTES
+            sound = how in (b"done", b"refused") and int(peak) <= MAX_KEPT_BYTES
         except TimeoutError:
             raise too_large(_label(work), f"more than {seconds:g}", seconds, "s") from None
         except (OSError, EOFError, ValueError):
@@ -110,7 +112,7 @@ class Worker:
         raise RuntimeError(answer[0].decode("utf-8", "replace"))
 
     def _wait(self, seconds: float) -> None:
-        """Wait for an answer's first byte.
+        """Wait for the first byte of an answer.
 
         Raises:
             TimeoutError: the work has used, or done nothing for, so much time.
@@ -119,7 +121,7 @@ class Worker:
         since = time.monotonic()
         with selectors.DefaultSelector() as answer:
             answer.register(self._channel, selectors.EVENT_READ)
-            while not answer.select(min(LOOK_S, seconds)):
+            while not answer.select(min(CHECK_INTERVAL_S, seconds)):
                 now = process_seconds(self.pid)
                 if now != used:
                     used, since = now, time.monotonic()
@@ -128,6 +130,7 @@ class Worker:
                     raise TimeoutError
 
     def _died(self, work: Work, seconds: float) -> RpcError:
+        """Kill the process and make the error for its end."""
         self.kill()
         return RpcError(
             Code.TOO_LARGE,
@@ -193,6 +196,7 @@ class Workers:
                 self._keep(worker)
 
     def _new(self) -> Worker:
+        """Start a process."""
         try:
             return Worker(self.memory_bytes)
         except OSError as error:  # descriptors, processes or memory have run out
@@ -200,14 +204,15 @@ class Workers:
             raise busy(f"no process could be started: {error.strerror}", data) from None
 
     def _keep(self, worker: Worker) -> None:
+        """Return a process to the idle ones, and end them all after `MAX_IDLE_S`."""
         if worker.kept:
             self._idle.append(worker)
         if self._timer is not None:
             self._timer.cancel()
-        self._timer = asyncio.get_running_loop().call_later(IDLE_S, self.rest)
+        self._timer = asyncio.get_running_loop().call_later(MAX_IDLE_S, self.rest)
 
     def rest(self) -> None:
-        """End the processes that have nothing to do."""
+        """End the idle processes."""
         while self._idle:
             self._idle.pop().kill()
         if self._timer is not None:
@@ -215,10 +220,11 @@ class Workers:
             self._timer = None
 
     def close(self) -> None:
-        """End all; the server ends."""
+        """End all processes when the server ends."""
         self.rest()
         self._threads.shutdown(wait=False)
 
 
 def _label(work: Work) -> str:
+    """Name a piece of work by its module."""
     return "the work of " + work.__module__.rsplit(".", 1)[-1].replace("_", " ")

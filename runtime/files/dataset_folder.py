@@ -37,10 +37,11 @@ from flexdt.twin.geometry.conventions import Float32Array
 
 Shape = tuple[int, int]
 MAX_TEXT_BYTES: Final = 1 << 30
+"""Largest text file of a data set [bytes]."""
 MAX_IMAGE_BYTES: Final = 1 << 29
-"""Of one image; the largest detector of a machine file of ours has 6 MB."""
-BLANK_SAMPLE: Final = 4096
-"""Bytes in the middle of an image's file by which it is found to hold something."""
+"""Largest image [bytes]; that of our largest detector has 6 MB."""
+BLANK_SAMPLE_BYTES: Final = 4096
+"""Bytes in the middle of an image's file that are examined first for other values than 0."""
 _IMAGE: Final = re.compile(r"(di|io|scan)[_-]?(\d+)\.tiff?", re.IGNORECASE)
 
 
@@ -58,7 +59,7 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class Folder:
-    """What lies in a folder; `names` are its regular files."""
+    """Listing of a folder; `names` are its regular files."""
 
     path: Path
     names: frozenset[str]
@@ -85,41 +86,41 @@ class Folder:
 
     @cached_property
     def darks(self) -> tuple[str, ...]:
-        """Dark images by number."""
+        """Names of dark images by number."""
         return tuple(self._images("di").values())
 
     @cached_property
     def flats(self) -> tuple[str, ...]:
-        """Flat images by number."""
+        """Names of flat images by number."""
         return tuple(self._images("io").values())
 
     @cached_property
     def projections(self) -> dict[int, str]:
-        """Number -> name of the projections that are there, in order."""
+        """Number -> name of the projections that exist, in order."""
         return self._images("scan")
 
     @property
     def last_index(self) -> int:
-        """Number of the last projection that is there, -1 if none is."""
+        """Number of the last projection that exists, -1 if there is none."""
         return max(self.projections, default=-1)
 
     def projection_name(self, index: int) -> str:
-        """Name that projection `index` has, or would have."""
+        """Return the name that projection `index` has, or would have."""
         return self.projections.get(index, f"scan_{index:06d}.tif")
 
     def frames(self, files: Sequence[str], shapes: Sequence[Shape]) -> tuple[Frame, ...]:
-        """Frames of these names and (rows, cols), in order."""
+        """List frames of these names and (rows, cols), in order."""
         return tuple(
             Frame(i, name, self.path / name, name in self.names, shape)
             for i, (name, shape) in enumerate(zip(files, shapes, strict=True))
         )
 
     def paths(self, files: Sequence[str]) -> tuple[Path, ...]:
-        """Paths of those of `files` that are there."""
+        """List the paths of those of `files` that exist."""
         return tuple(self.path / name for name in files if name in self.names)
 
     def lost(self, files: Sequence[str]) -> str:
-        """Which of `files` are not there, in words; "" if all are."""
+        """Describe which of `files` are missing; "" if none is."""
         lost = [name for name in files if name not in self.names]
         if not lost:
             return ""
@@ -127,21 +128,21 @@ class Folder:
         return f"{', '.join(lost[:5])}{more} {'is' if len(lost) == 1 else 'are'} missing"
 
     def _find(self, wanted: str) -> str | None:
+        """Find a name regardless of case."""
         return next((n for n in sorted(self.names) if n.lower() == wanted.lower()), None)
 
     @cached_property
     def duplicate(self) -> tuple[str, str] | None:
-        """Two images of one kind and number, if there are such."""
+        """Two images of one kind and number, or None."""
         return next((two for _, two in self._numbered.values() if two is not None), None)
 
     def _images(self, prefix: str) -> dict[int, str]:
+        """Return number -> name of the images with this prefix."""
         return self._numbered[prefix][0]
 
     @cached_property
     def _numbered(self) -> dict[str, tuple[dict[int, str], tuple[str, str] | None]]:
-        """Of each kind, number -> name in order, of two names with one number the first; and two
-        such names.
-        """
+        """Prefix -> (number -> name, in order; two names of one number, or None)."""
         found: dict[str, dict[int, str]] = {prefix: {} for prefix in ("di", "io", "scan")}
         twice: dict[str, tuple[str, str]] = {}
         for name in sorted(self.names):
@@ -163,9 +164,10 @@ _confined: Directory | None = None
 
 @contextmanager
 def confined(root: Directory) -> Iterator[None]:
-    """Inside, nothing that this process reads below `root` is reached through a link.
+    """Ensure that, inside, this process reads nothing below `root` through a link.
 
-    A user's own folders may well have links in them; what strangers ask a server for may not.
+    A user's own folders may well have links in them; what strangers ask a server for may
+    not.
     """
     global _confined
     before, _confined = _confined, root
@@ -176,7 +178,8 @@ def confined(root: Directory) -> Iterator[None]:
 
 
 def _within(path: Path) -> Directory | None:
-    """The directory at a path that is below the one that reading is confined to."""
+    """Return the directory at a path below the one that reading is confined to; None if
+    it is not."""
     if _confined is None or not path.is_relative_to(_confined.path):
         return None
     directory = _confined
@@ -186,7 +189,7 @@ def _within(path: Path) -> Directory | None:
 
 
 def opened(path: Path) -> BinaryIO:
-    """A file of a data set, to be read.
+    """Open a file of a data set for reading.
 
     Raises:
         OSError: there is none, or where reading is `confined`, it is no regular file.
@@ -196,7 +199,7 @@ def opened(path: Path) -> BinaryIO:
 
 
 def list_folder(path: Path) -> Folder:
-    """List a folder; where reading is `confined`, links to files are not among its files.
+    """List a folder; where reading is `confined`, links to files are left out.
 
     Raises:
         DatasetMissingError: there is no such folder, or it cannot be read.
@@ -213,7 +216,7 @@ def list_folder(path: Path) -> Folder:
 
 
 def read_text(path: Path, most: int = MAX_TEXT_BYTES) -> str:
-    """A text file as UTF-8, or as the scanners' Western European code page where it is not.
+    """Read a text file as UTF-8, else as the scanners' Western European code page.
 
     Raises:
         DatasetFormatError: it cannot be read or has more than `most` bytes.
@@ -235,14 +238,14 @@ def read_text(path: Path, most: int = MAX_TEXT_BYTES) -> str:
 
 
 def put_texts(files: Directory, record: ScanRecord) -> None:
-    """Write what describes a data set: the scanner's two texts, then flexdt.json."""
+    """Write the texts of a data set: the scanner's two, then flexdt.json."""
     files.put(SCAN_SETTINGS, format_scan_settings(record).encode("utf-8"))
     files.put(XRE_SETTINGS, format_xre(record).encode("utf-8"))
     files.put(DOCUMENT, DatasetDocument.of(record).to_json().encode("utf-8"))
 
 
 def read_document(folder: Directory) -> DatasetDocument:
-    """The flexdt.json of a data set in a data directory.
+    """Read the flexdt.json of a data set in a data directory.
 
     Raises:
         FileNotFoundError: there is none.
@@ -259,14 +262,14 @@ def read_document(folder: Directory) -> DatasetDocument:
 
 
 def read_image(path: Path, shape: tuple[int, int] | None = None) -> npt.NDArray[np.uint16]:
-    """One TIFF image, uint16 (rows, cols); raises as `read_values`."""
+    """Read one TIFF image, uint16 (rows, cols); raises as `read_values`."""
     return np.asarray(read_values(path, shape, "u"), dtype=np.uint16)
 
 
 def read_values(
     path: Path, shape: tuple[int, int] | None = None, kinds: str = "uf"
 ) -> npt.NDArray[np.uint16 | np.float32]:
-    """One TIFF image (rows, cols), uint16 or, where `kinds` has an f, float32.
+    """Read one TIFF image (rows, cols), uint16 or, where `kinds` has an f, float32.
 
     Raises:
         DatasetMissingError: it is not there.
@@ -293,10 +296,10 @@ def read_values(
 
 
 def _decoded(path: Path, kinds: str) -> npt.NDArray[np.uint16 | np.float32]:
-    """Pixels of a TIFF, once its head has been found to be that of an image of ours.
+    """Decode the pixels of a TIFF, once its head is known to be that of such an image.
 
-    A file of a few bytes may claim any size, and inflate to any: both are looked at before memory
-    is taken.
+    A file of a few bytes may claim any size, and inflate to any: both are looked at
+    before memory is taken.
     """
     import tifffile
 
@@ -331,7 +334,7 @@ def _decoded(path: Path, kinds: str) -> npt.NDArray[np.uint16 | np.float32]:
 
 
 def _check_inflation(path: Path, raw: BinaryIO, page: Any, size: int) -> None:
-    """Raise unless every strip inflates to no more than the image's `size` [bytes]."""
+    """Check that every strip inflates to no more than the image's `size` [bytes]."""
     raw.seek(0)
     content = raw.read()
     for start, length in zip(page.dataoffsets, page.databytecounts, strict=True):
@@ -343,7 +346,7 @@ def _check_inflation(path: Path, raw: BinaryIO, page: Any, size: int) -> None:
 
 
 def blank_images(folder: Folder, names: Sequence[str]) -> tuple[str, ...]:
-    """Those of the images that hold nothing but zeros; none if the last one holds more.
+    """List those of the images that are all zeros; none if the last one is not.
 
     They are what a scan that was stopped leaves of files that were made in advance.
     """
@@ -354,12 +357,12 @@ def blank_images(folder: Folder, names: Sequence[str]) -> tuple[str, ...]:
 
 
 def _blank(path: Path) -> bool:
-    """Whether all pixels of an image are zero; a sample of the file decides for most."""
+    """Return whether all pixels of an image are zero; a sample of the file decides for most."""
     try:
         with opened(path) as file:
             size = os.fstat(file.fileno()).st_size
             file.seek(size // 2)
-            if size > 4 * BLANK_SAMPLE and any(file.read(BLANK_SAMPLE)):
+            if size > 4 * BLANK_SAMPLE_BYTES and any(file.read(BLANK_SAMPLE_BYTES)):
                 return False
         return not read_values(path).any()
     except (OSError, ds.DatasetError):
@@ -367,7 +370,7 @@ def _blank(path: Path) -> bool:
 
 
 def mean_image(paths: Sequence[Path], shape: tuple[int, int]) -> Float32Array:
-    """Mean of several images, (rows, cols); raises as `read_image`."""
+    """Average several images, (rows, cols); raises as `read_image`."""
     total = np.zeros(shape, dtype=np.float64)
     for path in paths:
         total += read_image(path, shape)
@@ -375,10 +378,11 @@ def mean_image(paths: Sequence[Path], shape: tuple[int, int]) -> Float32Array:
 
 
 def tiff_bytes(image: npt.NDArray[np.uint16]) -> bytes:
-    """One uint16 image (rows, cols) as a baseline TIFF: little-endian, one strip, no metadata.
+    """Encode one uint16 image (rows, cols) as a baseline TIFF: little-endian, one strip,
+    no metadata.
 
-    The pixels begin at byte 8 and the tags follow them, as the scanner writes its files: some of
-    its readers look for pixels there without reading the tags.
+    The pixels begin at byte 8 and the tags follow them, as the scanner writes its files:
+    some of its readers look for pixels there without reading the tags.
     """
     rows, cols = image.shape
     pixels = image.astype("<u2", copy=False).tobytes()
@@ -407,7 +411,7 @@ def tiff_bytes(image: npt.NDArray[np.uint16]) -> bytes:
 
 
 def free_name(root: Directory, wish: str) -> str:
-    """`wish`, or `wish-2`, `wish-3`... whichever nothing in `root` has yet.
+    """Find the first of `wish`, `wish-2`, `wish-3`... that `root` does not have.
 
     Raises:
         DatasetNameError: `wish` is not plain.
@@ -418,5 +422,5 @@ def free_name(root: Directory, wish: str) -> str:
 
 
 def dated_name(moment: datetime, number: int = 1) -> str:
-    """A name as the scanner gives them: 201106_001."""
+    """Format a name as the scanner does: 201106_001."""
     return f"{moment:%y%m%d}_{number:03d}"

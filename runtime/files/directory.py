@@ -28,16 +28,18 @@ from flexdt.twin.dataset.file_names import plain_name
 TEMPORARY: Final = ".part-"
 """Prefix of temporary names; no plain name starts with a dot, so they never collide."""
 BEFORE: Final = ".before-"
-"""Prefix of the name under which what a change replaces is kept until the change has been made."""
-LARGEST: Final = 256 << 20
-"""Bytes of a file that is read whole, where its size is not known. The record of a scan of 200 000
-poses has about 50 MB; a sparse file may claim any size."""
+"""Prefix of the name under which a replaced file is kept until the change is complete."""
+MAX_READ_BYTES: Final = 256 << 20
+"""Largest file that is read as a whole, where its size is not known [bytes].
+
+The record of a scan of 200 000 poses has about 50 MB; a sparse file may claim any size.
+"""
 CGROUP_LIMIT: Final = Path("/sys/fs/cgroup/memory.max")
 CGROUP_USED: Final = Path("/sys/fs/cgroup/memory.current")
 CGROUP_STATISTICS: Final = Path("/sys/fs/cgroup/memory.stat")
 MEMORY_INFORMATION: Final = Path("/proc/meminfo")
-FALLBACK_MEMORY: Final = 4 << 30
-"""Assumed where the system does not say how much memory it has (Windows) [bytes]."""
+FALLBACK_MEMORY_BYTES: Final = 4 << 30
+"""Memory assumed where the system does not report it (Windows) [bytes]."""
 
 _NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _RELATIVE: Final = hasattr(os, "O_DIRECTORY")
@@ -47,14 +49,15 @@ _BINARY: Final = getattr(os, "O_BINARY", 0)
 _READ: Final = os.O_RDONLY | _NO_FOLLOW | _BINARY | getattr(os, "O_NONBLOCK", 0)
 _WRITE: Final = os.O_RDWR | _NO_FOLLOW | _BINARY
 _NEW: Final = os.O_RDWR | os.O_CREAT | os.O_EXCL | _NO_FOLLOW | _BINARY
-_NUMBERS: Final = itertools.count()
+_TEMPORARY_NUMBERS: Final = itertools.count()
 
 Write = Callable[[int, memoryview], int]
 
 
 @contextmanager
 def writing(path: Path, refused: str) -> Iterator[None]:
-    """Turn the system's refusals inside into `DatasetWriteError`, of a full disk `DiskFullError`.
+    """Convert the system's errors inside to `DatasetWriteError`, for a full disk to
+    `DiskFullError`.
 
     Args:
         path: of what is written.
@@ -70,7 +73,7 @@ def writing(path: Path, refused: str) -> Iterator[None]:
 
 
 def write_some(fd: int, data: memoryview) -> int:
-    """Write to a descriptor; returns how many bytes it took."""
+    """Write to a descriptor; return how many bytes it took."""
     return os.write(fd, data)
 
 
@@ -106,18 +109,18 @@ class Directory:
                 self._fd = os.open(path, _DIRECTORY)
 
     def folder(self, name: str, *, sync: bool = True, write: Write = write_some) -> Directory:
-        """The directory called `name` in this one, which need not exist yet.
+        """Return the directory called `name` in this one, which need not exist yet.
 
         It is opened anew for every call, unless it is `held`.
         """
         return Directory(self.path / name, sync=sync, write=write, above=self)
 
     def fileno(self) -> int | None:
-        """The descriptor, of one that is held open; None on a system without."""
+        """Return the descriptor of one that is held open; None on a system without."""
         return self._fd
 
     def held(self) -> Directory:
-        """This one, held open: whatever its name comes to stand for, it stays this directory.
+        """Hold it open: whatever its name refers to later, it stays this directory.
 
         Raises:
             DatasetWriteError: there is no such directory, or a link stands there.
@@ -128,7 +131,7 @@ class Directory:
         return self
 
     def make(self) -> None:
-        """Make it if it is missing; safe when this returns.
+        """Make the directory if it is missing; safe from a power cut when this returns.
 
         Raises:
             DatasetNameError: a link or a file stands there.
@@ -169,7 +172,7 @@ class Directory:
             raise self._failed(name, error, memoryview(data).nbytes) from None
 
     def keep(self, name: str, data: bytes) -> None:
-        """As `put`, in a directory that is made if missing; safe when this returns."""
+        """Write like `put`, in a directory that is made if missing; safe when this returns."""
         self.make()
         self.put(name, data)
         self.sync()
@@ -193,7 +196,8 @@ class Directory:
             os.close(file)
 
     def allocate(self, name: str, size: int) -> None:
-        """Make a file of `size` bytes that have their place on the disk, instead of its namesake.
+        """Make a file of `size` bytes whose blocks are reserved on the disk, in place of
+        its namesake.
 
         Raises:
             OSError: the system refuses, as for want of room; then there is no such file.
@@ -214,7 +218,7 @@ class Directory:
                 raise
 
     def nameless(self) -> BinaryIO:
-        """A new file without a name: it is gone when it is closed, or its process ends."""
+        """Make a file without a name: it is gone when it is closed, or its process ends."""
         with self._opened() as fd:
             name, made = self._temporary(fd, 0o600, getattr(os, "O_TEMPORARY", 0))
             if _RELATIVE:
@@ -222,10 +226,11 @@ class Directory:
         return os.fdopen(made, "w+b", buffering=0)
 
     def open(self, name: str) -> BinaryIO:
-        """A regular file, to be read.
+        """Open a regular file for reading.
 
         Raises:
-            OSError: there is none: a FileNotFoundError, or what stands there is another thing.
+            OSError: there is none: a FileNotFoundError, or what stands there is another
+                thing.
         """
         with self._opened() as fd:
             try:
@@ -239,8 +244,8 @@ class Directory:
             raise OSError(errno.EINVAL, "it is no regular file", str(self.path / name))
         return open(name, "rb", opener=lambda *_: file)  # some readers want to know a name
 
-    def read(self, name: str, most: int = LARGEST) -> bytes:
-        """The content of a regular file of at most `most` bytes.
+    def read(self, name: str, most: int = MAX_READ_BYTES) -> bytes:
+        """Read the content of a regular file of at most `most` bytes.
 
         Raises:
             OSError: as `open`, or it has more.
@@ -253,7 +258,7 @@ class Directory:
             return file.read(size)
 
     def link(self, name: str, second: str, to: Directory | None = None) -> None:
-        """Give what stands under `name` a second name, here or in another directory.
+        """Give the entry `name` a second name, here or in another directory.
 
         Raises:
             OSError: there is nothing, or the system has no links.
@@ -264,7 +269,7 @@ class Directory:
             os.link(*names, src_dir_fd=fd, dst_dir_fd=other, follow_symlinks=False)
 
     def rename(self, name: str, new: str) -> None:
-        """Rename an entry, in place of another one.
+        """Rename an entry, replacing one of the new name.
 
         Raises:
             OSError: there is none, or the system refuses.
@@ -282,7 +287,7 @@ class Directory:
             os.unlink(self._at(name), dir_fd=fd)
 
     def discard(self, name: str) -> None:
-        """Delete an entry that is no directory, and make that safe; none there is fine.
+        """Delete an entry that is no directory, safely; none there is no error.
 
         Raises:
             DatasetWriteError: the system refuses.
@@ -293,7 +298,7 @@ class Directory:
             self.sync()
 
     def stat(self, name: str) -> os.stat_result | None:
-        """What an entry is, a link itself; None where there is none.
+        """Return the status of an entry, of a link itself; None if there is none.
 
         Raises:
             OSError: it cannot be known.
@@ -305,13 +310,13 @@ class Directory:
             return None
 
     def is_directory(self, name: str) -> bool:
-        """Whether `name` is a directory and no link to one."""
+        """Return whether `name` is a directory and no link to one."""
         about = self.stat(name)
         return about is not None and stat.S_ISDIR(about.st_mode)
 
     @contextmanager
     def entries(self) -> Iterator[Iterator[os.DirEntry[str]]]:
-        """Everything in it, as `os.scandir`.
+        """List everything in it, as `os.scandir`.
 
         Raises:
             OSError: there is no such directory.
@@ -329,7 +334,8 @@ class Directory:
                 os.close(own)
 
     def names(self) -> set[str]:
-        """Names of the whole, regular files in it; none where there is no such directory."""
+        """List the names of the complete, regular files in it; none without such a
+        directory."""
         with suppress(FileNotFoundError, NotADirectoryError), self.entries() as entries:
             return {
                 e.name
@@ -339,7 +345,7 @@ class Directory:
         return set()
 
     def sweep(self, left: Sequence[str] = (TEMPORARY, BEFORE)) -> None:
-        """Delete what killed writers left behind: names that begin with one of `left`."""
+        """Delete what killed writers left: names that begin with one of `left`."""
         with suppress(OSError), self.entries() as entries:
             stale = [e.name for e in entries if e.name.startswith(tuple(left))]
             for name in stale:
@@ -347,7 +353,8 @@ class Directory:
                     self.unlink(name)
 
     def sync(self) -> None:
-        """Make the names safe: until then a power cut may undo the last changes of the directory.
+        """Make the names safe: before that a power cut may undo the last changes of the
+        directory.
 
         Raises:
             DatasetWriteError: the system refuses.
@@ -357,7 +364,7 @@ class Directory:
                 os.fsync(fd)
 
     def close(self) -> None:
-        """Give the descriptor back, once no call is under way."""
+        """Close the descriptor, once no call is under way."""
         with self._idle:
             self._idle.wait_for(lambda: self._busy == 0)
             self._closed = True
@@ -376,7 +383,7 @@ class Directory:
 
     @contextmanager
     def _opened(self) -> Iterator[int | None]:
-        """The descriptor; None on a system without."""
+        """Open the descriptor for a call; None on a system without."""
         if self._above is not None:
             fd = self._open_below(self._above)
             try:
@@ -397,27 +404,31 @@ class Directory:
                 self._idle.notify_all()
 
     def _open_below(self, above: Directory) -> int | None:
+        """Open the descriptor relative to the directory above, without following a link."""
         if not _RELATIVE:
             return None
         with above._opened() as fd:
             return os.open(above._at(self.path.name), _DIRECTORY | _NO_FOLLOW, dir_fd=fd)
 
     def _at(self, name: str) -> str:
-        """`name` for a call that takes the descriptor, too: one component, whoever says it."""
+        """Check that `name` is one component; return it for a call that takes the
+        descriptor, too."""
         if name in ("", ".", "..") or "/" in name or "\0" in name:
             raise OSError(errno.EINVAL, "no name of an entry", name)
         return name if _RELATIVE else str(self.path / name)
 
     def _temporary(self, fd: int | None, mode: int, flags: int = 0) -> tuple[str, int]:
-        """A new file under a name that nothing has yet, and its descriptor."""
+        """Make a file under an unused name; return the name and its descriptor."""
         while True:
             # Processes in containers may share a number, and killed ones leave files behind.
-            number = f"{os.getpid()}-{threading.get_native_id()}-{next(_NUMBERS)}"
+            number = f"{os.getpid()}-{threading.get_native_id()}-{next(_TEMPORARY_NUMBERS)}"
             name = self._at(f"{TEMPORARY}{number}")
             with suppress(FileExistsError):
                 return name, os.open(name, _NEW | flags, mode, dir_fd=fd)
 
     def _store(self, fd: int | None, name: str, data: memoryview) -> None:
+        """Write a file under a temporary name, flush it and rename it; nothing is left of
+        a failure."""
         temporary, file = self._temporary(fd, 0o644)
         try:
             try:
@@ -434,6 +445,7 @@ class Directory:
             raise
 
     def _failed(self, name: str, error: OSError, size: int) -> ds.DatasetWriteError:
+        """Convert a system error to DiskFullError or DatasetWriteError."""
         path = str(self.path / name)
         data = {"path": path, "bytes": size, "errno": error.errno, "free": free_bytes(self.path)}
         if error.errno in _NO_ROOM:
@@ -443,7 +455,7 @@ class Directory:
 
 
 def _allocate(file: int, size: int) -> None:
-    """Give a new file `size` bytes that later writes need no room for."""
+    """Reserve `size` bytes for a new file, so that later writes need no room."""
     allocate = getattr(os, "posix_fallocate", None)
     if allocate is not None:
         allocate(file, 0, size)
@@ -454,7 +466,8 @@ def _allocate(file: int, size: int) -> None:
 
 
 def free_bytes(path: Path) -> int | None:
-    """Bytes free for this user on the disk of `path`; None where the system does not say."""
+    """Return the bytes free for this user on the disk of `path`; None if the system does
+    not report them."""
     try:
         usage = os.statvfs(path)
     except (OSError, AttributeError):
@@ -463,8 +476,8 @@ def free_bytes(path: Path) -> int | None:
 
 
 def memory_bytes() -> int:
-    """The machine's memory, or the container's where that is less [bytes]."""
-    memory = FALLBACK_MEMORY
+    """Return the machine's memory, or the container's limit if that is less [bytes]."""
+    memory = FALLBACK_MEMORY_BYTES
     with suppress(AttributeError, ValueError):
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     with suppress(OSError, ValueError):  # no container, or none with a limit ("max")
@@ -473,7 +486,7 @@ def memory_bytes() -> int:
 
 
 def free_memory_bytes() -> int:
-    """Memory that new work can have: free, or holding files that can be read again [bytes].
+    """Estimate the memory that new work can have: free, or caching files [bytes].
 
     Half of the memory is assumed to be free where the system does not say it (not Linux).
     """
@@ -488,13 +501,14 @@ def free_memory_bytes() -> int:
 
 
 def _fields(file: Path) -> dict[str, int]:
-    """Numbers by name of a file of lines "name number ..."."""
+    """Parse the numbers of a file of lines "name number ..." by name."""
     lines = (line.split() for line in file.read_text(encoding="ascii").splitlines())
     return {words[0]: int(words[1]) for words in lines if len(words) > 1 and words[1].isdigit()}
 
 
 def open_data(root: Path) -> Directory:
-    """A twin's data directory, made if it is missing, once files can be written into it.
+    """Open a twin's data directory, made if it is missing; check that files can be
+    written into it.
 
     A full disk is no hindrance: what must be written has room of its own (`spare_files`).
 

@@ -18,20 +18,21 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from flexdt.protocol.field_checks import MAX_STEM, encoded
-from flexdt.runtime.files.directory import BEFORE, LARGEST, Directory, writing
+from flexdt.runtime.files.directory import BEFORE, MAX_READ_BYTES, Directory, writing
 from flexdt.runtime.log import log
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError, DiskFullError
 from flexdt.twin.errors import LimitError
 
 T = TypeVar("T")
 Keep = Callable[[str, bytes], None]
-"""Writes a file of a folder, safely."""
+"""Writes a file of a folder, safe from a power cut."""
 ASIDE = ".unreadable"
-"""Goes before the suffix of a file that is set aside; no name of ours has two dots."""
+"""Inserted before the suffix of a file that is set aside; none of our names has two dots."""
 
 
 def file_stem(name: str) -> str:
-    """`name`, percent-encoded, as the stem of a file; different names give different stems.
+    """Encode `name` with percent signs as the stem of a file; different names give
+    different stems.
 
     Raises:
         LimitError: it is too long for a file system.
@@ -65,7 +66,7 @@ class _Change:
     keep: Keep | None = None
 
     def undo(self) -> None:
-        """Restore what was there, unless somebody else has changed it since."""
+        """Restore the earlier content, unless somebody else has changed it since."""
         if not self._is_still():
             return
         if self.before is not None:
@@ -77,29 +78,32 @@ class _Change:
         self.folder.sync()
 
     def _is_still(self) -> bool:
+        """Return whether the file is as this change left it."""
         if self.data is None:
             return self.folder.stat(self.name) is None
-        found = self.folder.read(self.name, max(LARGEST, len(self.data)))
+        found = self.folder.read(self.name, max(MAX_READ_BYTES, len(self.data)))
         return found == self.data or (self.keep is not None and found.rstrip(b" ") == self.data)
 
 
 class Changes:
-    """Files written one after the other, which can all be as they were before.
+    """Files written one after the other, which can all be restored.
 
-    What a file replaces stays beside it under another name until `done` or `undo`, so that undoing
-    takes no room: a full disk is what it is most often needed for. `with Changes() as changes:`
-    undoes them where the block raises.
+    The replaced file is kept beside the new one under another name until `done` or
+    `undo`, so that undoing takes no room: a full disk is the usual reason for it. `with
+    Changes() as changes:` undoes them if the block raises.
     """
 
     def __init__(self) -> None:
         self._made: list[_Change] = []
 
     def put(self, folder: Directory, name: str, data: bytes, keep: Keep | None = None) -> None:
-        """Write a file, as `Directory.keep`.
+        """Write a file like `Directory.keep`, and keep the one it replaces until `done`
+        or `undo`.
 
         Args:
-            folder, name, data: where, and what.
-            keep: writes it instead, and may do so on a full disk; spaces may follow the data then.
+            folder, name, data: directory, file name and content.
+            keep: writes it instead, and may do so on a full disk; spaces may follow the
+                data then.
         """
         before, old = self._before(), None
         try:
@@ -117,7 +121,7 @@ class Changes:
         self.put(folder, name, data)
 
     def remove(self, folder: Directory, name: str) -> None:
-        """Delete a file, safely; none there is fine.
+        """Delete a file, safely; none there is no error.
 
         Raises:
             DatasetWriteError: the system refuses.
@@ -132,6 +136,7 @@ class Changes:
             folder.sync()
 
     def _before(self) -> str:
+        """Return an unused name for a replaced file."""
         return f"{BEFORE}{os.getpid()}-{threading.get_native_id()}-{len(self._made)}"
 
     def __enter__(self) -> Changes:
@@ -144,7 +149,7 @@ class Changes:
             self.undo()
 
     def done(self) -> None:
-        """Keep what was written."""
+        """Confirm the changes: delete the replaced files."""
         for change in self._made:
             if change.before is not None:
                 with suppress(OSError):
@@ -184,7 +189,7 @@ def _second_name(folder: Directory, name: str, second: str) -> bool:
 
 
 def read_json(data: bytes) -> object:
-    """What a JSON document says, if all its numbers are finite and all its texts are text.
+    """Parse a JSON document; all its numbers must be finite and its texts valid Unicode.
 
     Raises:
         ValueError: it is no such document.
@@ -197,12 +202,15 @@ def read_json(data: bytes) -> object:
 def read_or_set_aside(
     folder: Directory, name: str, read: Callable[[bytes], T], without: str
 ) -> T | None:
-    """What `read` makes of one of our files; None where there is none.
+    """Read one of our files; set it aside if it is damaged.
 
     Args:
-        folder, name: where it is; what is no regular file is damaged, too.
-        read: takes its bytes; whatever it raises means damage.
-        without: what the twin does without it, for the log.
+        folder, name: where it is; an entry that is no regular file is damaged, too.
+        read: parses its bytes; whatever it raises means damage.
+        without: what the twin does without the file, for the log.
+
+    Returns:
+        The result of `read`, or None if there is no file or a damaged one.
     """
     try:
         return read(folder.read(name))
@@ -214,7 +222,7 @@ def read_or_set_aside(
 
 
 def set_aside(folder: Directory, name: str, error: object, without: str) -> None:
-    """Keep what is damaged, or another thing than it should be, under another name; log one line"""
+    """Rename a damaged file, or another thing in its place, and log one line."""
     file = folder.path / name
     aside = f"{file.stem}{ASIDE}{file.suffix}"
     try:
@@ -226,9 +234,10 @@ def set_aside(folder: Directory, name: str, error: object, without: str) -> None
 
 
 def settle(root: Directory, folders: Sequence[str]) -> None:
-    """At the start: delete what killed writers left behind in a data directory and our folders.
+    """Clean a data directory and our folders at the start: delete what killed writers left.
 
-    What stands in the place of a folder of ours and is none, such as a link, is set aside.
+    An entry in the place of one of our folders that is no directory, such as a link, is
+    set aside.
     """
     for folder in (root, *map(root.folder, folders)):
         folder.sweep()
@@ -238,7 +247,8 @@ def settle(root: Directory, folders: Sequence[str]) -> None:
 
 
 def ours(folder: Directory) -> list[str]:
-    """Names of JSON documents in a folder, links among them, but for what was set aside."""
+    """List the names of JSON documents in a folder, links among them, except those set
+    aside."""
     with suppress(FileNotFoundError), folder.entries() as entries:
         names = sorted(e.name for e in entries if e.name.endswith(".json"))
         return [n for n in names if not n.endswith(f"{ASIDE}.json")]
@@ -246,6 +256,7 @@ def ours(folder: Directory) -> list[str]:
 
 
 def _finite(text: str) -> float:
+    """Parse a finite number, or raise ValueError."""
     value = float(text)
     if not math.isfinite(value):
         raise ValueError(f"{text} is no finite number")
@@ -255,9 +266,10 @@ def _finite(text: str) -> float:
 def lock_folder(root: Directory) -> Callable[[], None]:
     """Lock a data directory until the end of the process, or a call of what is returned.
 
-    The lock is on the directory itself, not on a file in it: there is nothing that somebody could
-    delete while a twin runs, or replace by a link beforehand. The system releases it when its
-    holder dies. Without effect where a directory cannot be opened (Windows) or locked.
+    The lock is on the directory itself, not on a file in it: there is nothing that
+    somebody could delete while a twin runs, or replace by a link beforehand. The system
+    releases it when its holder dies. Without effect where a directory cannot be opened
+    (Windows) or locked.
 
     Raises:
         DatasetWriteError: another process holds the lock.

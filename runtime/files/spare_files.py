@@ -17,8 +17,9 @@ from flexdt.runtime.files.directory import Directory, writing
 from flexdt.twin.dataset.dataset_errors import DiskFullError
 
 SIZE: Final = 256 << 10
-"""Of a spare file [bytes]; longer documents are written only where the disk has room."""
+"""Size of a spare file [bytes]; longer documents need room on the disk."""
 COUNT: Final = 8
+"""Number of spare files."""
 PREFIX: Final = ".reserve-"
 NAMES: Final = tuple(f"{PREFIX}{i}" for i in range(COUNT))
 
@@ -36,7 +37,7 @@ class SpareFiles:
         self._refill()
 
     def keep(self, name: str, data: bytes) -> None:
-        """Write a document, safe when this returns, as `Directory.keep`.
+        """Write a document, safe when this returns, into a spare file if the disk is full.
 
         Raises:
             DatasetWriteError: the system refuses, and there is no spare file.
@@ -50,6 +51,7 @@ class SpareFiles:
             self._refill()
 
     def _keep_in_spare(self, name: str, data: bytes) -> bool:
+        """Write a document into a spare file and rename it; False if there is none."""
         for spare in sorted(self._there):
             self._there.discard(spare)
             if not self._usable(spare):  # another name of the document, from a change taken back
@@ -65,7 +67,7 @@ class SpareFiles:
         return False
 
     def _save(self, name: str) -> None:
-        """Make a spare file of a document that is one by its size, and is about to be replaced."""
+        """Make a spare file of a document of that size that is about to be replaced."""
         about = self._folder.stat(name)
         free = [spare for spare in NAMES if spare not in self._there]
         if about is None or about.st_size != SIZE:
@@ -77,12 +79,12 @@ class SpareFiles:
                 return
 
     def _usable(self, name: str) -> bool:
-        """Whether a spare file is there, of full size, and no document too."""
+        """Return whether a spare file exists, of full size and with no other name."""
         about = self._folder.stat(name)
         return about is not None and (about.st_size, about.st_nlink) == (SIZE, 1)
 
     def _refill(self) -> None:
-        """Make the spare files that are missing, as far as there is room."""
+        """Make the missing spare files, as far as there is room."""
         for name in NAMES:
             if name in self._there:
                 continue

@@ -10,7 +10,8 @@ from pathlib import Path
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Where to write a file that replaces `path` as a whole; what fails leaves nothing behind."""
+    """Yield a path to write; the file replaces `path` as a whole, and a failure leaves
+    nothing."""
     part = path.with_name(f".{path.name}.part")
     try:
         yield part
@@ -26,7 +27,7 @@ def write_whole(path: Path, content: str | bytes) -> None:
 
 
 def nearest_there(path: Path) -> Path:
-    """`path` if it is there, else the nearest folder above it that is."""
+    """Return `path` if it exists, else the nearest folder above it that does."""
     there = path.absolute()
     while not there.exists():
         there = there.parent
@@ -34,11 +35,12 @@ def nearest_there(path: Path) -> Path:
 
 
 def bytes_of(path: Path) -> int:
-    """Size of a file, or of all files in a folder, such as a volume in `.zarr` [bytes]."""
+    """Sum up the size of a file, or of all files in a folder, such as a volume in `.zarr`
+    [bytes]."""
     files = (f for f in path.rglob("*") if f.is_file()) if path.is_dir() else iter([path])
     return sum(file.stat().st_size for file in files)
 
 
 def free_bytes(path: Path) -> int:
-    """Bytes free where `path` is, or will be."""
+    """Return the bytes free where `path` is, or will be."""
     return shutil.disk_usage(nearest_there(path)).free

@@ -7,10 +7,10 @@ from pathlib import Path
 
 
 def require_writable(path: Path | None) -> None:
-    """Refuse an output path that cannot be written.
+    """Check that an output path can be written.
 
-    A file without a name is made in the folder, or in the nearest one above it that exists, and is
-    gone at once.
+    A file without a name is made in the folder, or in the nearest one above it that
+    exists, and is gone at once.
 
     Args:
         path: of a file or a folder that need not exist; None is no output.

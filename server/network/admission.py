@@ -10,12 +10,12 @@ from flexdt.protocol.rpc_errors import not_authorised
 from flexdt.runtime.access import token_matches
 from flexdt.runtime.log import Sparing
 
-WRONG_TOKENS = 3
-"""Wrong tokens after which a connection is closed."""
+MAX_WRONG_TOKENS = 3
+"""Number of wrong tokens after which a connection is closed."""
 
 
 class TokenCheck:
-    """The token that a connection has to show.
+    """Checks the token of one connection.
 
     Args:
         token: of the server; None where it has none.
@@ -28,7 +28,14 @@ class TokenCheck:
         self._wrong = 0
 
     async def check(self, given: str | None, client: str) -> None:
-        """Compare a token; each wrong one is answered later than the one before.
+        """Compare a token with the server's; delay the answer to each wrong one more than
+        the last.
+
+        The connection is closed after `MAX_WRONG_TOKENS` wrong ones.
+
+        Args:
+            given: by the client; None for none.
+            client: name of the connection, for the log.
 
         Raises:
             RpcError: -32004, it is not the server's.
@@ -38,6 +45,6 @@ class TokenCheck:
         self._wrong += 1
         self._lines.log("wrong token", logging.WARNING, client=client, count=self._wrong)
         await asyncio.sleep(0.2 * self._wrong)
-        if self._wrong >= WRONG_TOKENS:
+        if self._wrong >= MAX_WRONG_TOKENS:
             self._close()
         raise not_authorised()

@@ -21,7 +21,7 @@ Lane = Callable[[Item], int]
 
 
 class Batch:
-    """The items of a batch that are left, the urgent ones first, and the answers so far.
+    """The remaining items of a batch, the urgent ones first, and the answers so far.
 
     Args:
         items: in the order in which they came.
@@ -45,7 +45,7 @@ class Batch:
         return self._size > self._most
 
     def next_item(self, *, urgent_alone: bool = False) -> Item | None:
-        """Take the next item out; None where none is left, or (`urgent_alone`) none is urgent."""
+        """Take out the next item; None if none is left, or (`urgent_alone`) none is urgent."""
         if not self._left:
             return None
         index, item = self._left[0]
@@ -60,7 +60,7 @@ class Batch:
         answer: m.Response | m.Failure | None,
         encode: Callable[[m.Response | m.Failure], list[bytes]],
     ) -> None:
-        """Keep the answer to the item that was taken last; a notification has none."""
+        """Keep the answer to the item that was taken out last; a notification has none."""
         if answer is None:
             return
         body = encode(answer)
@@ -71,16 +71,17 @@ class Batch:
         self._size += size
 
     def bodies(self) -> list[list[bytes]]:
-        """The answers, in the order of their items."""
+        """Return the answers in the order of their items."""
         return [body for _, body in sorted(self._bodies.items())]
 
 
 @dataclass(frozen=True)
 class Split:
-    """A batch that stands in the queue while its urgent items are served.
+    """A batch that stays in the queue while its urgent items are served.
 
     Attributes:
-        raw: its bytes in the queue, held here so that no other message has their identity.
+        raw: its bytes in the queue, held here so that no other message has their
+            identity.
         batch: the items, and their answers.
         urgent_done: set once the urgent ones have been served.
     """

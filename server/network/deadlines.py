@@ -31,6 +31,6 @@ class Deadlines:
             timer.cancel()
 
     def clear(self) -> None:
-        """Cancel all."""
+        """Cancel all timeouts."""
         for timer in self._timers.values():
             timer.cancel()

@@ -32,6 +32,8 @@ class LoopTurns:
         await turn
 
     def _give(self) -> None:
+        """Give the first waiting connection of the lowest lane its turn, and schedule the
+        next."""
         self._due = False
         for lane in self._lanes:
             while lane:

@@ -21,8 +21,9 @@ from flexdt.protocol import messages as m
 from flexdt.protocol.rpc_errors import internal
 from flexdt.runtime.access import ConnectionLimits
 
-A_WRITE = 1 << 18
-"""Bytes given to the transport at a time, since it copies what it cannot send at once."""
+WRITE_BYTES = 1 << 18
+"""Largest number of bytes given to the transport at a time; it copies what it cannot send
+at once."""
 
 
 class SendTarget(Protocol):
@@ -58,7 +59,7 @@ class Outbox:
         self.send(self.encode(message))
 
     def send(self, body: Sequence[bytes]) -> None:
-        """Send or queue what `encode` has made, or several of them as a batch."""
+        """Send or queue the body from `encode`, or several of them as a batch."""
         wire = self.link.wire
         try:
             pieces = wire.framed(body)
@@ -67,7 +68,7 @@ class Outbox:
         self._put_all(pieces)
 
     def encode(self, message: m.Response | m.Failure) -> list[bytes]:
-        """The body of an answer, or of why it cannot be sent."""
+        """Encode an answer; if it cannot be sent, encode the error instead."""
         wire = self.link.wire
         try:
             body = wire.body(message)
@@ -94,20 +95,23 @@ class Outbox:
         self._put_event(message)
 
     def _put_event(self, message: m.Message | Prepared) -> None:
+        """Encode and send an event; log one that cannot be encoded."""
         try:
             self._put_all(self.link.wire.pieces(message))
         except (RpcError, ValueError, TypeError, OverflowError):
             self.link.log("event not sent", logging.ERROR, error=True)
 
     def _put_all(self, pieces: Sequence[bytes]) -> None:
-        if sum(map(len, pieces)) <= A_WRITE:
+        """Send or queue pieces, large ones in writes of `WRITE_BYTES` bytes."""
+        if sum(map(len, pieces)) <= WRITE_BYTES:
             self._put(b"".join(pieces))
             return
         for piece in pieces:
-            for at in range(0, len(piece), A_WRITE):
-                self._put(piece[at : at + A_WRITE])
+            for at in range(0, len(piece), WRITE_BYTES):
+                self._put(piece[at : at + WRITE_BYTES])
 
     def _put(self, data: bytes) -> None:
+        """Write bytes to the transport if it takes them, else queue them."""
         if self.over or self.link.transport.is_closing():
             return  # asyncio would complain of every write to a connection that is gone
         if self.ready.is_set():
@@ -117,11 +121,11 @@ class Outbox:
             self.unsent += len(data)
 
     def pause(self) -> None:
-        """The transport is full."""
+        """Stop writing: the transport is full."""
         self.ready.clear()
 
     def resume(self) -> None:
-        """The transport takes more."""
+        """Write the queue, then the newest value of each slot: the transport takes more."""
         self.ready.set()
         while self.queue and self.ready.is_set():
             data = self.queue.popleft()
@@ -151,7 +155,7 @@ class Outbox:
 
 
 def _not_finite(value: object, path: str = "$") -> str | None:
-    """Path of the first number that JSON cannot represent, for the log."""
+    """Find the path of the first number that JSON cannot represent, for the log."""
     match value:
         case float():
             return None if math.isfinite(value) else f"{path}: {value}"

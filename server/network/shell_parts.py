@@ -55,7 +55,7 @@ async def answered(
 
 
 def unobserved(method: str, seconds: float, code: int | None) -> None:
-    """An `Observe` that takes no notice."""
+    """Ignore an answered request; an `Observe` for servers without metrics."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Call:
 
     @property
     def message(self) -> m.Request | m.Notification:
-        """The message as it concerns the order of requests and answers: without parameters."""
+        """The message without parameters, as it concerns the order of requests and answers."""
         return m.Request(self.id, self.method) if self.answered else m.Notification(self.method)
 
 
@@ -90,7 +90,7 @@ class Frozen:
     method: str
 
     def thawed(self) -> m.Single | Call:
-        """The message."""
+        """Unpickle the message."""
         message: m.Single | Call = pickle.loads(self.data)
         return message
 
@@ -125,7 +125,7 @@ class Peer(Protocol):
         """Send an event: the newest of its `slot`, or (None) in order with all others."""
 
     def close(self, reason: str) -> None:
-        """End the connection after what is queued has gone out."""
+        """End the connection after the queue has been sent."""
 
 
 Open = Callable[[Peer], Session]

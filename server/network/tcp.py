@@ -40,26 +40,27 @@ from flexdt.runtime.waiting_room import Room, neighbourhood
 from flexdt.server.network import admission, batches, deadlines, loop_turns, outbox
 from flexdt.server.network import shell_parts as parts
 
-READ_AHEAD = 512 << 10
-"""Bytes of whole messages that one connection may have waiting; then it is read no further."""
-AT_ONCE: Final = 1 << 15
-"""Bytes taken from one connection before others have their turn: 8 192 empty frames, a few ms."""
-LARGE = 32 << 10
-"""Bytes of a message above which it is read apart."""
+READ_AHEAD_BYTES = 512 << 10
+"""Bytes of complete messages that may wait for one connection; then reading pauses."""
+BUFFER_BYTES: Final = 1 << 15
+"""Bytes taken from one connection before others have their turn: 8 192 empty frames, a
+few ms."""
+MAX_INLINE_BYTES = 32 << 10
+"""Bytes of a message above which it is read in another process."""
 ESTOP = "safety.estop"
-"""Served before everything else."""
+"""Method that is served before everything else."""
 ESTOP_BYTES = ESTOP.encode()
 Given = Mapping[str, object] | list[object] | Params | RpcError | None
 """Parameters as they came, or as they were validated apart."""
-URGENT_AT_ONCE = 8
-"""Urgent requests of one connection in service; further ones wait their turn like any other.
-E-stops may be four times as many."""
+MAX_URGENT_IN_SERVICE = 8
+"""Largest number of urgent requests of one connection in service; E-stops four times as
+many."""
 LOOK_S = 0.001
-"""How long one turn of the loop looks for urgent requests other than E-stops [s]."""
-RESERVED = 16
-"""Clients beyond `max_clients` that are served what is urgent."""
-STRANGE = 10
-"""Messages without the token after which a connection is closed."""
+"""Time for which one turn of the loop searches for urgent requests other than E-stops [s]."""
+RESERVED_PLACES = 16
+"""Number of clients beyond `max_clients` whose urgent requests are served."""
+MAX_STRANGE_MESSAGES = 10
+"""Number of messages without the token after which a connection is closed."""
 HELLO = "session.hello"
 
 
@@ -76,7 +77,10 @@ class TcpServer(ListeningServer):
 
     def __post_init__(self) -> None:
         self.links: set[_Link] = set()
-        self.waiting, self.reserved = Room[_Link](waiting_room.WAITING), Room[_Link](RESERVED)
+        self.waiting, self.reserved = (
+            Room[_Link](waiting_room.WAITING),
+            Room[_Link](RESERVED_PLACES),
+        )
         self.lines = Sparing()
         self.turns = loop_turns.LoopTurns()
         self.urgent = tuple(x.name.encode() for x in self.methods.values() if x.urgent)
@@ -85,17 +89,19 @@ class TcpServer(ListeningServer):
         self.opened = 0
 
     def connection(self) -> _Link:
-        """What serves one connection, whatever carries its bytes."""
+        """Make the protocol of one connection, whatever carries its bytes."""
         return _Link(self)
 
     def look_soon(self, link: _Link) -> None:
-        """Have the urgent requests of a connection found, in turns that no flood can fill."""
+        """Schedule a search for urgent requests of a connection, in turns that no flood
+        can fill."""
         self._to_look_at[link] = None
         if not self._look_due:
             self._look_due = True
             asyncio.get_running_loop().call_soon(self._look)
 
     def _look(self) -> None:
+        """Search connections for urgent requests for up to `LOOK_S`; reschedule the rest."""
         until = time.perf_counter() + LOOK_S
         try:
             while self._to_look_at:
@@ -141,11 +147,15 @@ async def serve(
         ssl: for TLS.
         methods: there are.
         observe: told of every answer.
-        read: reads large messages; None: they are read in the loop, which then waits for it.
+        read: reads large messages; None: they are read in the loop, which then waits for
+            it.
 
     Raises:
         AccessError: the address can be reached by others and there is no token.
         OSError: the address is taken or not ours.
+
+    Returns:
+        The listening server.
     """
     check_bind(host, token)
     limits = limits or ConnectionLimits()
@@ -163,7 +173,7 @@ class _Link(asyncio.BufferedProtocol):
         self.name = self.address = ""
         self.number = self.served = 0
         self.calls: Correlation[None] = Correlation(Role.SERVER)
-        self.read = memoryview(bytearray(AT_ONCE))
+        self.read = memoryview(bytearray(BUFFER_BYTES))
         self.gone = asyncio.Event()
         self.session: parts.Session | None = None
         self.let_in = server.token is None
@@ -188,6 +198,8 @@ class _Link(asyncio.BufferedProtocol):
     # -- the transport's calls ---------------------------------------------------------------
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Set up a new connection, which waits for a place; open its session without a
+        token."""
         self.transport = cast(asyncio.Transport, transport)
         self.loop = asyncio.get_running_loop()
         self.server.opened += 1
@@ -206,7 +218,8 @@ class _Link(asyncio.BufferedProtocol):
         self.worker.add_done_callback(self._crashed)
 
     def _seat(self) -> bool:
-        """Take a place if there is one, or a reserved one; whether it has one of its own."""
+        """Give the connection a place, or a reserved one; return whether it has one of
+        its own."""
         server = self.server
         if self in server.links:
             return True
@@ -220,15 +233,19 @@ class _Link(asyncio.BufferedProtocol):
         return False
 
     def _no_place(self) -> RpcError:
+        """Make the error for a server with too many clients."""
         return errors.busy("too many clients", {"allowed": self.limits.max_clients})
 
     def get_buffer(self, sizehint: int) -> memoryview:
+        """Return the buffer for the next bytes."""
         return self.read
 
     def buffer_updated(self, nbytes: int) -> None:
+        """Process the bytes in the buffer."""
         self.data_received(bytes(self.read[:nbytes]))
 
     def data_received(self, data: bytes) -> None:
+        """Divide received bytes into messages; find E-stops at once, other urgent ones soon."""
         before = self.wire.waiting
         self.wire.feed(data)
         if self.wire.waiting > before:  # before an E-stop is taken out
@@ -248,17 +265,18 @@ class _Link(asyncio.BufferedProtocol):
             self.deadlines.stop("message")  # the rest comes when we read again
 
     def overtake(self) -> None:
-        """Begin with what is urgent of what has come, wherever in the queue it stands."""
+        """Start the urgent requests of what has arrived, wherever in the queue they are."""
         if self.gone.is_set() or not self.let_in:
             return
         found: list[Coroutine[object, object, None]] = []
 
         def wanted(raw: bytes) -> bool:
-            if len(raw) > LARGE:
+            """Decode a message and start it if it is urgent; return whether to take it out."""
+            if len(raw) > MAX_INLINE_BYTES:
                 return False  # it costs more than a look; it is urgent in its turn
             message = self.wire.decode(raw)
             lane, served = self._lane(message), len(self.tasks) + len(found)
-            if lane == loop_turns.ORDINARY or served >= URGENT_AT_ONCE * (
+            if lane == loop_turns.ORDINARY or served >= MAX_URGENT_IN_SERVICE * (
                 4 if lane == loop_turns.FIRST else 1
             ):
                 return False
@@ -280,6 +298,7 @@ class _Link(asyncio.BufferedProtocol):
                 self.server.look_soon(self)
 
     def eof_received(self) -> bool:
+        """Note the client's end of stream; replies may take `end_timeout_s`."""
         self.ended = True
         self.arrived.set()
         self.deadlines.stop("message")
@@ -287,6 +306,7 @@ class _Link(asyncio.BufferedProtocol):
         return self.transport.get_extra_info("ssl_object") is None
 
     def connection_lost(self, exc: Exception | None) -> None:
+        """Cancel the work of an ended connection and close its session."""
         self.deadlines.clear()
         for task in (*self.tasks, *([self.worker] if self.worker else [])):
             task.cancel()
@@ -303,10 +323,12 @@ class _Link(asyncio.BufferedProtocol):
         self.gone.set()
 
     def pause_writing(self) -> None:
+        """Queue messages: the client reads too slowly."""
         self.out.pause()
         self.deadlines.start("send", self.limits.send_timeout_s)
 
     def resume_writing(self) -> None:
+        """Send the queue: the client reads again."""
         self.deadlines.stop("send")
         self.out.resume()
 
@@ -314,22 +336,25 @@ class _Link(asyncio.BufferedProtocol):
 
     @property
     def codec(self) -> Codec:
+        """Codec of the connection; JSON until its first byte."""
         return self.wire.codec or Codec.JSON
 
     def post(self, message: m.Message | Prepared, slot: str | None = None) -> None:
+        """Send or queue an event; see `Peer.post`."""
         self.out.event(message, slot)
 
     def close(self, reason: str) -> None:
+        """End the connection after the queue has been sent."""
         self.log("closing", reason=reason)
         self.transport.close()
         self.deadlines.start("send", self.limits.send_timeout_s)
 
     def end(self) -> None:
-        """The server ends."""
+        """Abort the connection: the server ends."""
         self.transport.abort()
 
     def displace(self) -> None:
-        """A newer connection needs the room: a client learns why it ends, a stranger does not."""
+        """End the connection for a newer one; a client is told why, a stranger is not."""
         if self.let_in:
             self.out.reply(m.Failure(None, self._no_place()))
         if self.let_in and not self.transport.get_write_buffer_size():
@@ -345,12 +370,14 @@ class _Link(asyncio.BufferedProtocol):
         self.server.lines.log(event, level, kind=kind, error=error, client=self.name, **facts)
 
     def abort(self, reason: str) -> None:
+        """Abort the connection and log the reason."""
         self.log("cut off", logging.WARNING, reason=reason)
         self.transport.abort()
 
     # -- requests ----------------------------------------------------------------------------
 
     def _open(self) -> None:
+        """Admit the connection and open the application's session."""
         self.let_in = True
         self.loop.call_soon(self.overtake)  # what came before was not looked at
         self.deadlines.stop("hello")
@@ -362,7 +389,7 @@ class _Link(asyncio.BufferedProtocol):
             self.abort("the application did not open a session")
 
     def _lane(self, message: m.Message | parts.Frozen) -> int:
-        """Which lane it may take: an E-stop's, one of the urgent, the ordinary."""
+        """Determine the lane of a message: an E-stop's, an urgent one, the ordinary."""
         name = ""
         match message:
             case m.Batch(items):
@@ -377,9 +404,12 @@ class _Link(asyncio.BufferedProtocol):
         return loop_turns.FIRST if name == ESTOP else loop_turns.URGENT
 
     def _urgent(self, message: m.Message | parts.Frozen) -> bool:
+        """Return whether a message is not ordinary."""
         return self._lane(message) != loop_turns.ORDINARY
 
     async def _work(self) -> None:
+        """Serve the connection's messages in order, one in each turn, until its stream
+        has ended."""
         while True:
             while self.wire.whole:
                 await self.server.turns.take(
@@ -410,17 +440,18 @@ class _Link(asyncio.BufferedProtocol):
             await self.arrived.wait()
 
     def _answer_the_end(self) -> None:
-        """Say so if the client has ended its stream inside a message."""
+        """Send an error if the client has ended its stream inside a message."""
         try:
             self.wire.receive_end()
         except ProtocolError as error:
             self.out.reply(m.Failure(None, errors.parse_error(str(error))))
 
     async def _decoded(self, raw: bytes) -> m.Message | parts.Frozen | tuple[parts.Frozen, ...]:
+        """Decode a message, a large one in another process; errors become `Malformed`."""
         read = self.server.read
-        if not self.let_in and len(raw) > LARGE:
+        if not self.let_in and len(raw) > MAX_INLINE_BYTES:
             return m.Malformed(errors.not_authorised())
-        if read is None or len(raw) <= LARGE:
+        if read is None or len(raw) <= MAX_INLINE_BYTES:
             return self.wire.decode(raw)
         try:
             return await read(raw, self.wire)
@@ -433,7 +464,7 @@ class _Link(asyncio.BufferedProtocol):
     async def _serve(
         self, message: m.Message | parts.Frozen | tuple[parts.Frozen, ...], *, urgent: bool = False
     ) -> None:
-        """Answer one message, in a turn that it has; urgent: get one first."""
+        """Answer one message or batch; an urgent one waits for a turn first."""
         match message:
             case m.Batch(items):
                 await self._answer_batch(self._batch(items), waits=urgent)
@@ -447,6 +478,7 @@ class _Link(asyncio.BufferedProtocol):
                     await self._send(self.out.encode(answer))
 
     def _batch(self, items: Sequence[m.Single | parts.Frozen]) -> batches.Batch:
+        """Make a batch with this connection's lanes and size limit."""
         return batches.Batch(items, self._lane, MAX_ANSWER[self.codec])
 
     async def _begin(self, split: batches.Split) -> None:
@@ -457,6 +489,7 @@ class _Link(asyncio.BufferedProtocol):
             split.urgent_done.set()
 
     async def _answer_batch(self, batch: batches.Batch, *, waits: bool) -> None:
+        """Serve the items of a batch and send the answers together."""
         await self._items(batch, waits=waits)
         if bodies := batch.bodies():
             await self._send(self.wire.batch(bodies))
@@ -464,7 +497,7 @@ class _Link(asyncio.BufferedProtocol):
     async def _items(
         self, batch: batches.Batch, *, waits: bool, urgent_alone: bool = False
     ) -> None:
-        """Each item that is left in a turn of its own; waits: the first one, too."""
+        """Serve each remaining item in a turn of its own; `waits`: the first one as well."""
         while (item := batch.next_item(urgent_alone=urgent_alone)) is not None:
             if waits:
                 await self._turn(item)
@@ -473,15 +506,26 @@ class _Link(asyncio.BufferedProtocol):
             batch.keep(await self._answer(item, batch.too_large if full else None), self.out.encode)
 
     async def _send(self, body: list[bytes]) -> None:
+        """Send a body, and wait while the client has too many unread replies."""
         self.out.send(body)
         await self.out.room()
 
     async def _turn(self, message: m.Message | parts.Frozen) -> None:
+        """Wait for a turn in the message's lane."""
         await self.server.turns.take(self, self._lane(message))
 
     async def _answer(
         self, message: m.Message | parts.Frozen, refused: RpcError | None = None
     ) -> m.Response | m.Failure | None:
+        """Answer one message, and check that the client may send it.
+
+        Args:
+            message: decoded, or read in another process.
+            refused: error to answer with instead of serving it.
+
+        Returns:
+            The answer; None for a notification.
+        """
         item = message.thawed() if isinstance(message, parts.Frozen) else message
         try:
             self.calls.receive(item.message if isinstance(item, parts.Call) else item)
@@ -502,12 +546,14 @@ class _Link(asyncio.BufferedProtocol):
         return None
 
     def _count(self, *, broken: bool) -> None:
-        """Close after too many broken messages in a row; without the token any message is one."""
+        """Count broken messages in a row; without the token every message counts. Close
+        after too many."""
         self.broken = self.broken + 1 if broken or not self.let_in else 0
-        if self.broken >= (self.limits.malformed if self.let_in else STRANGE):
+        if self.broken >= (self.limits.malformed if self.let_in else MAX_STRANGE_MESSAGES):
             self.loop.call_soon(self.close, f"{self.broken} broken messages in a row")
 
     async def _call(self, id: m.Id, name: str, given: Given) -> m.Response | m.Failure:
+        """Serve a call, and count and log it."""
         self.served += 1
         trace = f"{self.number}.{self.served}"
         return await parts.answered(
@@ -516,6 +562,7 @@ class _Link(asyncio.BufferedProtocol):
         )  # fmt: skip
 
     async def _try(self, id: m.Id, name: str, given: Given, trace: str) -> m.Response | m.Failure:
+        """Check token, rate, place and parameters of a call, and have the session handle it."""
         try:
             if not self.let_in and name != HELLO:
                 raise errors.not_authorised()
@@ -541,6 +588,7 @@ class _Link(asyncio.BufferedProtocol):
             return m.Failure(id, errors.internal(trace))
 
     async def _check_token(self, hello: Hello) -> None:
+        """Check the token and the protocol version of a hello, and admit the connection."""
         if self.server.token is None:
             return
         await self.token_check.check(hello.token, self.name)
@@ -550,6 +598,7 @@ class _Link(asyncio.BufferedProtocol):
             self._seat()
 
     def _check_rate(self) -> None:
+        """Raise RpcError if the client sends more than `requests_per_s`."""
         rate = self.limits.requests_per_s
         if rate is None:
             return
@@ -562,35 +611,37 @@ class _Link(asyncio.BufferedProtocol):
 
     @property
     def _load(self) -> int:
-        """Requests that wait, and urgent ones that are being served."""
+        """Number of waiting requests and of urgent ones in service."""
         return self.wire.waiting + len(self.tasks)
 
     @property
     def _full(self) -> bool:
-        """Whether enough waits to stop reading; a message that has begun may come to its end."""
+        """Whether so much waits that reading pauses; an incomplete message may be completed."""
         ahead = self.wire.pending if self.wire.whole or not self.let_in else 0
-        most = READ_AHEAD if self.let_in else LARGE
+        most = READ_AHEAD_BYTES if self.let_in else MAX_INLINE_BYTES
         return self._load >= self.limits.max_waiting or ahead > most
 
     def _relax(self) -> None:
-        """Read again once enough of what was read has been served."""
+        """Resume reading once enough of what was read has been served."""
         ahead = self.wire.pending if self.wire.whole else 0
-        if self._load <= self.limits.max_waiting // 2 and ahead <= READ_AHEAD // 2:
+        if self._load <= self.limits.max_waiting // 2 and ahead <= READ_AHEAD_BYTES // 2:
             self.transport.resume_reading()
 
     def _done(self, task: asyncio.Task[None]) -> None:
+        """Remove an ended task."""
         self.tasks.discard(task)
         self._crashed(task)
         if not self.gone.is_set():
             self._relax()
 
     def _crashed(self, task: asyncio.Task[None]) -> None:
-        """Handlers' failures are answered; anything that still gets here ends the connection."""
+        """Log the failure of a task and abort; handlers' failures are answered before that."""
         if not task.cancelled() and (error := task.exception()) is not None:
             self.log("connection failed", logging.ERROR, error_type=repr(error))
             self.transport.abort()
 
     def _start(self, work: Coroutine[object, object, None]) -> None:
+        """Run work as a task of the connection."""
         task = self.loop.create_task(work)
         self.tasks.add(task)
         task.add_done_callback(self._done)

@@ -6,8 +6,8 @@ and the event loop stays responsive. A job's blocks go to the loop as they are m
 Steps are computed in the order in which they come, and a lane has one of them in the queue at a
 time, so lanes take turns and a long scan never starves a single view. A lane is one client's batch
 work or one client's interactive work. A block is asked for when the one before it has been sent,
-and at most `IN_HAND` requests of a lane have results on their way: of a client that does not read
-no more than these is computed.
+and at most `MAX_IN_HAND` requests of a lane have results on their way: of a client that does not
+read no more than these is computed.
 
 `begin` sets the number of threads and compiles before the first request.
 """
@@ -35,13 +35,14 @@ from flexdt.twin.projection.analytic import warm_up_forward
 from flexdt.twin.projection.kernels.compiling import LOG
 
 COMPILE_BACK_AFTER_S: Final = 60.0
-"""So that the first scan of a new installation has both cores."""
+"""Delay before back projection is compiled [s], so that a first scan has all cores."""
 BLOCK_BYTES: Final = 12 * 2**20
-"""Result of one turn of a job: below a frame, and short enough to share the machine fairly."""
+"""Result of one turn of a job [bytes]: below a frame, and short enough to share the machine."""
 BLOCK_VIEWS: Final = 32
+"""Largest number of views of one turn."""
 
-IN_HAND: Final = 3
-"""Of a lane, requests that are computed or sent: one is computed while others are sent."""
+MAX_IN_HAND: Final = 3
+"""Largest number of requests of a lane that are computed or sent."""
 
 Step = Callable[[], object]
 """A piece of work; its value goes to whoever waits for it."""
@@ -52,7 +53,7 @@ class Lane(asyncio.Lock):
 
     def __init__(self) -> None:
         super().__init__()
-        self.in_hand = asyncio.Semaphore(IN_HAND)
+        self.in_hand = asyncio.Semaphore(MAX_IN_HAND)
 
 
 @dataclass(eq=False)
@@ -74,18 +75,18 @@ class ComputeJob:
 
     @property
     def waits(self) -> bool:
-        """Whether a step of it waits and is not being computed."""
+        """Whether a step waits and is not being computed."""
         running = self._step is not None and self._step.running()
         return self._turn is not None and not (running or self._turn.done())
 
     def end(self, error: Exception) -> None:
-        """Give it up: whoever waits for a step of it gets `error`, and there are no more."""
+        """Cancel the job: whoever waits for a step gets `error`, and further steps raise it."""
         self.error = self.error or error
         if self._turn is not None:
             self._turn.cancel()
 
     async def run(self, compute: ComputeThread, step: Step) -> object:
-        """The value of a step, once it has had its turn.
+        """Compute a step in its turn and return its value.
 
         Raises:
             Exception: the step's, or the one that the job was given up with.
@@ -101,6 +102,7 @@ class ComputeJob:
             raise self.error from None
 
     async def _in_turn(self, compute: ComputeThread, step: Step) -> object:
+        """Wait for the lane, then put the step into the thread's queue."""
         if not self._in_hand:
             self._in_hand = await self.lane.in_hand.acquire()
         async with self.lane:
@@ -108,7 +110,7 @@ class ComputeJob:
             return await asyncio.wrap_future(self._step)
 
     def sent(self) -> None:
-        """Its answer has gone out, or nobody waits for it: another request of the lane begins."""
+        """Release the lane for another request: the answer was sent, or nobody waits for it."""
         if self._in_hand:
             self._in_hand = False
             self.lane.in_hand.release()
@@ -139,6 +141,7 @@ class ComputeThread:
         self._thread.join(timeout_s)
 
     def _run(self) -> None:
+        """Compute steps until `close`."""
         while (put := self._steps.get()) is not None:
             future, step = put
             if future.set_running_or_notify_cancel():
@@ -151,9 +154,10 @@ class ComputeThread:
 def projection_steps(
     body: Body, rows: npt.NDArray[np.float64], shape: tuple[int, int], block: int
 ) -> Iterator[Step]:
-    """Steps of `block` views each; every value is float32 (views, rows, cols)."""
+    """Yield steps of `block` views each; every value is float32 (views, rows, cols)."""
 
     def step(part: npt.NDArray[np.float64]) -> Step:
+        """Make the step of some rows."""
         return lambda: project_body(body, part, shape)
 
     for start in range(0, len(rows), block):
@@ -161,13 +165,16 @@ def projection_steps(
 
 
 def views_a_block(shape: tuple[int, int]) -> int:
-    """How many views a turn computes."""
+    """Compute how many views a turn computes."""
     return max(1, min(BLOCK_VIEWS, BLOCK_BYTES // (4 * shape[0] * shape[1])))
 
 
 def begin(threads: int) -> None:
-    """Set the thread count of this thread's kernels, and load or compile those that project; those
-    that project back, which few ask for, are compiled meanwhile and behind all other work.
+    """Set the thread count of this thread's kernels, and load or compile the projection
+    kernels.
+
+    Those of back projection, which few clients need, are compiled later in a thread of
+    low priority.
 
     Raises:
         ValueError: more threads than numba was started with.
@@ -179,6 +186,7 @@ def begin(threads: int) -> None:
 
 
 def _compile_back() -> None:
+    """Compile the back projection after `COMPILE_BACK_AFTER_S`, at low priority."""
     time.sleep(COMPILE_BACK_AFTER_S)
     os.nice(10)  # Linux: of this thread, and of the process that it starts
     if not compile_ahead.is_compiled("back projection"):
@@ -186,6 +194,6 @@ def _compile_back() -> None:
 
 
 def backend() -> str:
-    """What computes: "numba" on the processor, or the name of the CUDA device before it."""
+    """Name what computes: "numba" on the processor, or the CUDA device before it."""
     found = gpu.availability()
     return f"{found.reason} (CUDA), numba" if found.present else "numba"

@@ -31,13 +31,13 @@ from flexdt.server.projector.volume_store import VolumeStore
 from flexdt.server.projector.wire import FrameLink
 
 PART_BYTES: Final = 8 * 2**20
-"""Payload of a part of what does not fit into one frame."""
-SPARE: Final = 4096
-"""Room for everything but the payload in a frame."""
+"""Payload of a part of a result that does not fit into one frame [bytes]."""
+SPARE_BYTES: Final = 4096
+"""Room in a frame for everything but the payload [bytes]."""
 
 
 class JobClient:
-    """One connection, its jobs and its requests that are under way."""
+    """One connection, its jobs and its requests under way."""
 
     def __init__(self, link: FrameLink, token: str | None, lines: Sparing) -> None:
         self.link, self.let_in = link, token is None
@@ -46,22 +46,22 @@ class JobClient:
         self.calls: Correlation[None] = Correlation(Role.SERVER)
         self.tasks: set[asyncio.Task[None]] = set()
         self.received = 0
-        """Messages so far."""
+        """Number of messages so far."""
         self.pending_bytes = 0
         self.address = neighbourhood(link.peer.rpartition(":")[0])
         self.token_check = TokenCheck(token, self.close_soon, lines)
 
     def begin(self, id: Id, key: str | None = None) -> ComputeJob:
-        """The work of a request, known by its id until that is answered."""
+        """Make the job of a request, which is known by its id until that is answered."""
         job = self.jobs[id] = ComputeJob(self.lanes[key is not None], key)
         return job
 
     def displace(self) -> None:
-        """A newer connection needs the room."""
+        """Abort the connection: a newer one needs the room."""
         self.link.transport.abort()
 
     def close_soon(self) -> None:
-        """End the connection once its last answer has gone out."""
+        """End the connection once its last answer has been sent."""
         asyncio.get_running_loop().call_later(0.1, self.link.transport.close)
 
 
@@ -95,11 +95,11 @@ class Context:
 
     @property
     def waiting(self) -> int:
-        """Requests whose work waits for its turn."""
+        """Number of requests whose work waits for its turn."""
         return sum(job.waits for client in self.clients.values() for job in client.jobs.values())
 
     async def run(self, client: JobClient, id: Id, step: Step) -> object:
-        """The value of the one step of a request."""
+        """Compute the one step of a request and return its value."""
         return await client.begin(id).run(self.compute, step)
 
     def supersede(self, client: JobClient, key: str) -> None:
@@ -112,8 +112,13 @@ class Context:
     async def send_array(
         self, client: JobClient, id: Id, array: npt.NDArray[np.generic]
     ) -> dict[str, object]:
-        """An array as the result of a request; what does not fit has gone before, in parts."""
-        if array.nbytes + SPARE <= MAX_FRAME:
+        """Make an array the result of a request; one that does not fit into a frame is
+        sent in parts.
+
+        Returns:
+            {dtype, shape, data}, or {dtype, shape, parts} with the number of parts sent.
+        """
+        if array.nbytes + SPARE_BYTES <= MAX_FRAME:
             return image.encode(array)
         parts = await self.send_parts(client, id, array, 0)
         return {"dtype": array.dtype.name, "shape": list(array.shape), "parts": parts}
@@ -121,7 +126,8 @@ class Context:
     async def send_parts(
         self, client: JobClient, id: Id, array: npt.NDArray[np.generic], start: int
     ) -> int:
-        """Send an array as parts of a result, from its element `start` on; how many."""
+        """Send an array as parts of a result, from its element `start` on; return their
+        number."""
         flat = np.ascontiguousarray(array).reshape(-1)
         step = PART_BYTES // flat.itemsize
         parts = 0

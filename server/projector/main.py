@@ -18,7 +18,7 @@ from flexdt.runtime.settings import parse
 
 
 async def run(options: ProjectorSettings) -> int:
-    """Serve until SIGTERM or SIGINT; returns the exit code."""
+    """Serve until SIGTERM or SIGINT; return the exit code."""
     from flexdt.runtime.http_pages import Requests, served_pages
     from flexdt.server.projector.compute import backend, begin
     from flexdt.server.projector.service import projector_pages, serve_projector
@@ -51,7 +51,7 @@ async def run(options: ProjectorSettings) -> int:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the process; returns its exit code."""
+    """Run the process; return its exit code."""
     options = parse(ProjectorSettings, argv)
     set_up(level=LEVELS[options.log_level], apart=True)
     return run_process(options, run)

@@ -28,17 +28,18 @@ from flexdt.server.projector.compute import (
     projection_steps,
     views_a_block,
 )
-from flexdt.server.projector.job_context import SPARE, Context, JobClient
+from flexdt.server.projector.job_context import SPARE_BYTES, Context, JobClient
 from flexdt.twin.projection import TriangleMesh, Volume, back
 from flexdt.twin.projection.operators import as_cone_vec
 
 MAX_VIEW_BYTES: Final = 512 * 2**20
+"""Largest view [bytes]."""
 
 Answer = Callable[[Context, JobClient, Id, Any], Awaitable[object]]
 
 
 async def hello(context: Context, client: JobClient, id: Id, p: Hello) -> object:
-    """Check the token."""
+    """Check the token and admit the client; return the server's version and instance."""
     await client.token_check.check(p.token, client.link.peer)
     client.let_in = True
     client.link.deadlines.stop("hello")
@@ -49,7 +50,7 @@ async def hello(context: Context, client: JobClient, id: Id, p: Hello) -> object
 
 
 async def volume_put(context: Context, client: JobClient, id: Id, p: wire.VolumePut) -> object:
-    """Store a scene, or a chunk of voxels or of a mesh."""
+    """Store a scene, or a chunk of voxels or of a mesh; prepare a complete volume."""
     if p.scene is not None:
         context.store.put(p.name, scene_from_dict(p.scene), evictable=p.evictable)
         return {"name": p.name, "received": 0, "total": 0, "complete": True}
@@ -78,7 +79,7 @@ async def volume_get(context: Context, client: JobClient, id: Id, p: wire.Volume
 
 
 async def volume_list(context: Context, client: JobClient, id: Id, p: Params) -> object:
-    """Volumes and memory."""
+    """List the volumes and the memory they take."""
     return {
         "volumes": context.store.describe(),
         "memory_used": context.store.used,
@@ -87,12 +88,13 @@ async def volume_list(context: Context, client: JobClient, id: Id, p: Params) ->
 
 
 async def volume_remove(context: Context, client: JobClient, id: Id, p: wire.VolumeRef) -> object:
-    """Forget a volume."""
+    """Remove a volume."""
     return {"removed": context.store.remove(p.name)}
 
 
 async def project(context: Context, client: JobClient, id: Id, p: wire.Project) -> object:
-    """Line integrals, view block by view block."""
+    """Compute line integrals, block of views by block; replace a waiting request of the
+    same key."""
     volume = context.store.get(p.volume)
     view = math.prod(p.detector)
     if 4 * view > MAX_VIEW_BYTES:
@@ -107,7 +109,7 @@ async def project(context: Context, client: JobClient, id: Id, p: wire.Project) 
         views = await job.run(context.compute, step)
         assert isinstance(views, np.ndarray)
         context.views += len(views)
-        if len(views) == len(rows) and views.nbytes + SPARE <= MAX_FRAME:
+        if len(views) == len(rows) and views.nbytes + SPARE_BYTES <= MAX_FRAME:
             return image.encode(views)
         parts += await context.send_parts(client, id, views, done * view)
         done += len(views)
@@ -115,7 +117,7 @@ async def project(context: Context, client: JobClient, id: Id, p: wire.Project) 
 
 
 async def backproject(context: Context, client: JobClient, id: Id, p: wire.Backproject) -> object:
-    """The adjoint, answered or added to a named volume."""
+    """Compute the adjoint, and answer it or add it to a named volume."""
     if len(p.projections) != len(p.cone_vec):
         raise invalid_params(
             f"{len(p.projections)} projections and {len(p.cone_vec)} rows of cone_vec"
@@ -132,7 +134,7 @@ async def backproject(context: Context, client: JobClient, id: Id, p: wire.Backp
 
 
 async def health(context: Context, client: JobClient, id: Id, p: Params) -> object:
-    """Figures about the server."""
+    """Return figures about the server."""
     return {
         "instance": context.instance,
         "version": version("flexdt"),
@@ -150,7 +152,7 @@ async def health(context: Context, client: JobClient, id: Id, p: Params) -> obje
 
 
 async def cancel(context: Context, client: JobClient, id: Id, p: wire.Cancel) -> object:
-    """Give up a request."""
+    """Cancel a request of this client."""
     job = client.jobs.get(p.request)
     if job is not None:
         job.end(cancelled(p.request))
@@ -158,16 +160,18 @@ async def cancel(context: Context, client: JobClient, id: Id, p: wire.Cancel) ->
 
 
 async def discover(context: Context, client: JobClient, id: Id, p: Params) -> object:
-    """The OpenRPC document."""
+    """Return the OpenRPC document."""
     return _document()
 
 
 @cache
 def _document() -> object:
+    """Make the OpenRPC document, once."""
     return openrpc_document(wire.PROJECTOR_METHODS, title="flexdt projector server")
 
 
 def _accumulator(context: Context, name: str | None, grid: wire.VoxelGrid) -> Volume | None:
+    """Return the named volume that a back projection is added to, or None."""
     if name is None or name not in context.store:
         return None
     held = context.store.get(name)
@@ -177,6 +181,7 @@ def _accumulator(context: Context, name: str | None, grid: wire.VoxelGrid) -> Vo
 
 
 def _prepared(volume: Volume | TriangleMesh) -> Volume | TriangleMesh:
+    """Check that a volume is finite, and make its projection layout."""
     if isinstance(volume, Volume):
         if not np.isfinite(volume.data).all():
             raise invalid_params("the volume holds numbers that are not finite")
@@ -185,6 +190,7 @@ def _prepared(volume: Volume | TriangleMesh) -> Volume | TriangleMesh:
 
 
 def _backproject(p: wire.Backproject, old: Volume | None) -> Volume:
+    """Compute a back projection, added to `old`."""
     blank = np.broadcast_to(np.float32(0), p.grid.shape)
     made = back(p.projections, p.cone_vec, Volume(blank, p.grid.voxel_mm, p.grid.center_mm))
     data = np.ascontiguousarray(made.data)

@@ -43,12 +43,12 @@ from flexdt.server.projector.wire import FrameLink
 from flexdt.twin.errors import TwinError
 
 MAX_PENDING_BYTES: Final = 64 * 2**20
-"""Bytes of unanswered requests of one client above which it is not read any more."""
+"""Bytes of one client's unanswered requests above which it is not read."""
 HELLO: Final = "session.hello"
-STRANGER_FRAME: Final = 32 << 10
-"""Largest frame that is taken from a connection without the token [bytes]."""
-STRANGE: Final = 10
-"""Messages without the token after which a connection is closed."""
+MAX_STRANGER_FRAME_BYTES: Final = 32 << 10
+"""Largest frame of a connection without the token [bytes]."""
+MAX_STRANGE_MESSAGES: Final = 10
+"""Number of messages without the token after which a connection is closed."""
 Given = Mapping[str, object] | list[object] | None
 """Parameters of a call as they came."""
 
@@ -81,16 +81,16 @@ class ProjectorServer(ListeningServer):
     # -- connections -------------------------------------------------------------------------
 
     def made(self, link: FrameLink) -> None:
-        """A client has connected."""
+        """Register a new connection, which waits for a place."""
         client = JobClient(link, self.context.token, self.context.lines)
         self.context.clients[link] = client
         self.waiting.enter(client)
         if not client.let_in:
-            link.max_frame = min(STRANGER_FRAME, link.max_frame)
+            link.max_frame = min(MAX_STRANGER_FRAME_BYTES, link.max_frame)
             link.deadlines.start("hello", self.limits.hello_timeout_s)
 
     def lost(self, link: FrameLink) -> None:
-        """A client has gone: nothing more is computed for it."""
+        """Remove an ended connection, cancel its requests and drop its uploads."""
         client = self.context.clients.pop(link)
         self.waiting.leave(client)
         self.seated.discard(client)
@@ -99,7 +99,7 @@ class ProjectorServer(ListeningServer):
             task.cancel()
 
     def _seat(self, client: JobClient) -> None:
-        """Give a client a place; one that has been let in may send whole frames.
+        """Give a client a place; one that has been admitted may send whole frames.
 
         Raises:
             RpcError: -32003, all places are taken.
@@ -124,13 +124,14 @@ class ProjectorServer(ListeningServer):
         link.dismiss(m.Failure(None, error))
 
     def frame(self, link: FrameLink, body: memoryview) -> None:
-        """A client's message."""
+        """Serve a client's frame in a task; refuse it from one with too many, or without
+        a token."""
         client = self.context.clients[link]
         if len(client.tasks) >= self.limits.max_waiting:
             self.refuse(link, errors.busy("too many requests under way"))
             return
         client.received += 1
-        if not client.let_in and client.received > STRANGE:
+        if not client.let_in and client.received > MAX_STRANGE_MESSAGES:
             self.refuse(link, errors.not_authorised())
             return
         client.pending_bytes += len(body)
@@ -143,6 +144,7 @@ class ProjectorServer(ListeningServer):
     # -- requests ----------------------------------------------------------------------------
 
     async def _serve(self, client: JobClient, body: memoryview) -> None:
+        """Decode a frame, answer its request and release the client's lane."""
         request: m.Id = None
         link, calls = client.link, client.calls
         try:
@@ -180,6 +182,7 @@ class ProjectorServer(ListeningServer):
     async def _call(
         self, client: JobClient, id: m.Id, name: str, given: Given
     ) -> m.Response | m.Failure:
+        """Serve a call, and count and log it."""
         return await answered(
             self._try(client, id, name, given), name, trace=str(id), client=client.link.peer,
             known=PROJECTOR_METHODS, observe=self.observe,
@@ -188,6 +191,7 @@ class ProjectorServer(ListeningServer):
     async def _try(
         self, client: JobClient, id: m.Id, name: str, given: Given
     ) -> m.Response | m.Failure:
+        """Check token, parameters and place of a call, and answer it."""
         try:
             if not client.let_in and name != HELLO:
                 raise errors.not_authorised()
@@ -277,13 +281,15 @@ async def serve_projector(
 
 
 def projector_pages(server: ProjectorServer, requests: Requests) -> Pages:
-    """The pages of a projector that runs."""
+    """Make the monitoring pages of a running projector."""
     context = server.context
 
     def health() -> dict[str, object]:
+        """Return the facts of `/healthz`."""
         return {"server": f"flexdt projector {version('flexdt')}"}
 
     def figures() -> list[Metric]:
+        """List the figures of `/metrics`."""
         store = context.store
         return [
             gauge("flexdt_connections", "Clients connected.", len(server.seated)),

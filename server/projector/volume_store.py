@@ -18,17 +18,17 @@ from flexdt.protocol.rpc_errors import RpcError, invalid_params, problem, too_la
 from flexdt.twin.projection import Body, TriangleMesh, Volume
 
 LAYOUT_COPIES = 2
-"""A volume's voxels are kept twice: as they came and z-contiguous."""
+"""Number of copies of a volume's voxels: as they came, and z-contiguous."""
 
-NAMED = 50
-"""Volumes that an error lists, those used last."""
+MAX_LISTED_NAMES = 50
+"""Number of volumes that an error lists, those used last."""
 SOLID_BYTES = 1024
-"""Counted for each solid of a scene."""
+"""Memory counted for each solid of a scene [bytes]."""
 
 
 @dataclass
 class _Upload:
-    """Voxels or a mesh that are still coming, and their bytes."""
+    """Voxels or a mesh whose bytes are still arriving."""
 
     owner: object
     what: wire.VoxelGrid | wire.MeshSize
@@ -36,7 +36,7 @@ class _Upload:
     received: int = 0
 
     def whole(self) -> Volume | TriangleMesh:
-        """What they are once all have come.
+        """Make the volume or mesh of the complete bytes.
 
         Raises:
             GeometryError: a mesh that does not close.
@@ -61,7 +61,7 @@ class VolumeStore:
     def __init__(self, limit: int) -> None:
         self.limit = limit
         self._held: dict[str, Body] = {}
-        """The least recently used first."""
+        """Name -> volume, the least recently used first."""
         self._evictable: set[str] = set()
         self._bytes = self._evictable_bytes = 0
         self._uploads: dict[tuple[object, str], _Upload] = {}
@@ -79,17 +79,17 @@ class VolumeStore:
 
     @property
     def evictable(self) -> int:
-        """Bytes of these that make room where it is needed."""
+        """Bytes of evictable volumes."""
         return self._evictable_bytes
 
     def get(self, name: str) -> Body:
-        """The volume called `name`.
+        """Look up the volume called `name`, which becomes the most recently used.
 
         Raises:
             RpcError: -32602, listing the names.
         """
         if name not in self._held:
-            last = list(self._held)[-NAMED:]
+            last = list(self._held)[-MAX_LISTED_NAMES:]
             older = len(self._held) - len(last)
             more = f" and {older} others" if older else ""
             raise invalid_params(
@@ -101,7 +101,7 @@ class VolumeStore:
         return value
 
     def put(self, name: str, value: Body, *, evictable: bool = False) -> None:
-        """Store a whole volume, mesh or scene under `name`, in place of its namesake.
+        """Store a complete volume, mesh or scene under `name`, replacing its namesake.
 
         Args:
             name, value: what.
@@ -126,15 +126,17 @@ class VolumeStore:
         start: int,
         data: memoryview,
     ) -> tuple[int, Callable[[], Volume | TriangleMesh] | None]:
-        """Take a chunk of voxels or of a mesh.
+        """Receive a chunk of voxels or of a mesh.
 
         Chunks come in order. The complete volume is not stored: `put` does that.
 
         Returns:
-            Bytes received so far and, once all have come, what makes the volume or mesh of them.
+            Bytes received so far and, once all have come, what makes the volume or mesh
+            of them.
 
         Raises:
-            RpcError: -32008 above the memory limit; -32602, chunks that do not fit together.
+            RpcError: -32008 above the memory limit; -32602, chunks that do not fit
+                together.
         """
         total = what.nbytes
         key = (owner, name)
@@ -158,7 +160,7 @@ class VolumeStore:
         return end, upload.whole
 
     def remove(self, name: str) -> bool:
-        """Forget a volume; returns whether there was one."""
+        """Remove a volume; return whether there was one."""
         value = self._held.pop(name, None)
         if value is None:
             return False
@@ -174,11 +176,20 @@ class VolumeStore:
             del self._uploads[key]
 
     def describe(self) -> list[wire.VolumeInfo]:
-        """All volumes, by name."""
+        """Describe all volumes, by name."""
         return [_info(name, self._held[name]) for name in sorted(self._held)]
 
     def reserve(self, what: str, needed: int, replaced: str | None = None) -> None:
-        """Make room for `needed` bytes more, in place of a volume's; -32008 where there is none."""
+        """Make room for a volume by removing evictable ones, the least recently used first.
+
+        Args:
+            what: the volume, for the message.
+            needed: its memory [bytes].
+            replaced: name of the volume whose place it takes.
+
+        Raises:
+            RpcError: -32008, above the memory limit; nothing is removed.
+        """
         old = self._held.get(replaced) if replaced is not None else None
         used = self.used - (0 if old is None else memory_of(old))
         kept = memory_of(old) if old is not None and replaced in self._evictable else 0
@@ -196,7 +207,7 @@ class VolumeStore:
 
 
 def memory_of(value: Body) -> int:
-    """Bytes counted for a volume, mesh or scene."""
+    """Compute the memory counted for a volume, mesh or scene [bytes]."""
     if isinstance(value, Volume):
         return LAYOUT_COPIES * 4 * math.prod(value.shape)
     if isinstance(value, TriangleMesh):
@@ -205,12 +216,14 @@ def memory_of(value: Body) -> int:
 
 
 def _needed(what: wire.VoxelGrid | wire.MeshSize) -> int:
+    """Compute the memory counted for an upload [bytes]."""
     if isinstance(what, wire.VoxelGrid):
         return LAYOUT_COPIES * what.nbytes
     return 24 * (what.vertices + what.triangles) + what.nbytes
 
 
 def _bad_chunk(name: str, asked: int, allowed: int) -> RpcError:
+    """Make the error for a chunk at byte `asked` where `allowed` is expected."""
     return invalid_params(
         f"volume {name!r}: a chunk at or up to byte {asked} does not fit; expected {allowed}",
         [problem("start", "chunks must come in order", asked)],
@@ -219,6 +232,7 @@ def _bad_chunk(name: str, asked: int, allowed: int) -> RpcError:
 
 
 def _info(name: str, value: Body) -> wire.VolumeInfo:
+    """Describe a volume, mesh or scene."""
     if isinstance(value, TriangleMesh):
         triangles = len(value.faces)
         return wire.VolumeInfo(name=name, kind="mesh", bytes=memory_of(value), triangles=triangles)

@@ -35,13 +35,13 @@ from flexdt.runtime.process import tune
 from flexdt.server.network.deadlines import Deadlines
 
 SILENT_S: Final = 10.0
-"""A projector that sends nothing for so long, while it is asked something, has gone."""
+"""Silence after which a projector that owes an answer counts as lost [s]."""
 ASK_AGAIN_S: Final = 3.0
-"""After so long it is asked for its health, which one that computes answers, too."""
-SLICE: Final = 1 << 18
-"""Bytes handed to the transport at a time."""
-LAST_WORD_S: Final = 1.0
-"""How long a dismissed peer may go on sending."""
+"""Time after which it is asked for its health, which it answers also while it computes [s]."""
+SLICE_BYTES: Final = 1 << 18
+"""Largest number of bytes given to the transport at a time."""
+MAX_LAST_WORD_S: Final = 1.0
+"""Time for which a dismissed peer may go on sending [s]."""
 
 
 @dataclass(eq=False, repr=False)
@@ -79,14 +79,14 @@ class FrameLink(asyncio.BufferedProtocol):
         self.lost = False
         self.peer = "?"
         self.heard = 0.0
-        """When something last came, by the loop's clock."""
+        """Time of the last received bytes, by the loop's clock [s]."""
 
     # -- the transport's calls ---------------------------------------------------------------
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Tune the socket."""
+        """Tune the socket and call `on_made`."""
         self.transport = cast(asyncio.Transport, transport)
-        self.transport.set_write_buffer_limits(high=SLICE // 2)
+        self.transport.set_write_buffer_limits(high=SLICE_BYTES // 2)
         sock = self.transport.get_extra_info("socket")
         tune(sock)
         if sock.family in (socket.AF_INET, socket.AF_INET6):
@@ -95,14 +95,14 @@ class FrameLink(asyncio.BufferedProtocol):
         self.on_made(self)
 
     def get_buffer(self, sizehint: int) -> memoryview:
-        """Where the next bytes go: the length, or the frame's own memory."""
+        """Return the memory for the next bytes: the length, or the frame's own memory."""
         if self._over:
-            return memoryview(bytearray(SLICE))
+            return memoryview(bytearray(SLICE_BYTES))
         target = self._head if self._body is None else self._body
         return target[self._filled :]
 
     def buffer_updated(self, count: int) -> None:
-        """Bytes have arrived."""
+        """Count received bytes; pass a complete frame to `on_frame`."""
         if self._over:
             return
         self._filled += count
@@ -117,6 +117,8 @@ class FrameLink(asyncio.BufferedProtocol):
             self.on_frame(self, body)
 
     def _begin(self, size: int) -> None:
+        """Reserve memory for a frame of `size` bytes; call `on_broken` for one that is
+        too large."""
         self._filled = 0
         if size > self.max_frame:
             self._over = True
@@ -136,19 +138,19 @@ class FrameLink(asyncio.BufferedProtocol):
         return False
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """The connection has ended."""
+        """Record that the connection has ended, and call `on_lost`."""
         self.lost = True
         self.deadlines.clear()
         self._writable.set()
         self.on_lost(self)
 
     def pause_writing(self) -> None:
-        """The peer reads too slowly."""
+        """Pause sending: the peer reads too slowly."""
         self._writable.clear()
         self.deadlines.start("send", self.send_timeout_s)
 
     def resume_writing(self) -> None:
-        """The peer reads again."""
+        """Resume sending: the peer reads again."""
         self.deadlines.stop("send")
         self._writable.set()
 
@@ -160,7 +162,7 @@ class FrameLink(asyncio.BufferedProtocol):
     # -- for the owner -----------------------------------------------------------------------
 
     async def send(self, message: m.Message) -> None:
-        """Send a message; returns when the transport has taken it.
+        """Send a message; return when the transport has taken it.
 
         Raises:
             ConnectionResetError: the connection has ended.
@@ -174,7 +176,7 @@ class FrameLink(asyncio.BufferedProtocol):
             await self._writable.wait()
 
     def dismiss(self, message: m.Message) -> None:
-        """Send a last message and end the connection; what still comes in is thrown away.
+        """Send a last message and end the connection; discard what still arrives.
 
         Closing at once with bytes unread would reset the connection and lose the message.
         """
@@ -185,20 +187,22 @@ class FrameLink(asyncio.BufferedProtocol):
         self._write(head)
         if self.transport.can_write_eof():
             self.transport.write_eof()
-            self.deadlines.start("end", LAST_WORD_S)
+            self.deadlines.start("end", MAX_LAST_WORD_S)
         else:
             self.transport.close()
 
     async def _send_payload(self, payload: memoryview) -> None:
+        """Send a payload slice by slice; abort if it is cancelled."""
         try:
-            for start in range(0, len(payload), SLICE):
+            for start in range(0, len(payload), SLICE_BYTES):
                 await self._writable.wait()
-                self._write(payload[start : start + SLICE])
+                self._write(payload[start : start + SLICE_BYTES])
         except asyncio.CancelledError:
             self.transport.abort()  # half a frame has gone out: the stream cannot go on
             raise
 
     def _write(self, data: bytes | memoryview) -> None:
+        """Write to the transport; raise ConnectionResetError if the connection has ended."""
         if self.lost or self.transport.is_closing():
             raise ConnectionResetError(f"the connection to {self.peer} has ended")
         self.transport.write(data)
@@ -217,6 +221,7 @@ class _Pending:
     parts: npt.NDArray[np.float32] | None = None
 
     def part(self, params: Mapping[str, object]) -> None:
+        """Copy a part into the array of the result."""
         start, data = params.get("start"), params.get("data")
         if self.shape is None or not isinstance(start, int):
             return
@@ -289,6 +294,7 @@ class ProjectorLink:
     async def _request(
         self, method: str, params: Mapping[str, object], shape: tuple[int, ...] | None
     ) -> tuple[object, npt.NDArray[np.float32] | None]:
+        """Send a request and wait for its answer and parts; cancel it if this is cancelled."""
         pending = _Pending(asyncio.get_running_loop().create_future(), shape)
         request = self._calls.request(method, params, pending, current()[:100])
         sent = False
@@ -309,8 +315,8 @@ class ProjectorLink:
             self._calls.abandon(request, sent=sent)
 
     async def _until_answered(self, answer: asyncio.Future[Any]) -> None:
-        """Wait as long as the projector shows that it is there; one that was silent for `SILENT_S`
-        has its connection closed, and so its requests fail."""
+        """Wait as long as the projector is alive; close the connection to one that is
+        silent for `SILENT_S`."""
         loop = asyncio.get_running_loop()
         asked = loop.time()
         while not (await asyncio.wait([answer], timeout=ASK_AGAIN_S))[0]:
@@ -320,15 +326,18 @@ class ProjectorLink:
                 self._keep(asyncio.ensure_future(self.ask("health", {})))
 
     def _keep(self, note: asyncio.Future[Any]) -> None:
+        """Keep a reference to a future until it is done."""
         self._notes.add(note)
         note.add_done_callback(self._noted)
 
     def _noted(self, note: asyncio.Future[Any]) -> None:
+        """Drop a future that is done, and retrieve its exception."""
         self._notes.discard(note)
         if not note.cancelled():
             note.exception()  # a connection that has ended needs no cancellation
 
     def _frame(self, link: FrameLink, body: memoryview) -> None:
+        """Pass the answers and parts of a frame to their requests."""
         try:
             received = self._calls.receive(frames.unpack(body))
         except ProtocolError:
@@ -343,9 +352,11 @@ class ProjectorLink:
                         waiter.part(params)
 
     def _broken(self, link: FrameLink, error: RpcError) -> None:
+        """Abort a connection that breaks the protocol."""
         link.transport.abort()
 
     def _lost(self, link: FrameLink) -> None:
+        """Fail all open requests with `LinkLost`."""
         if link.mid_frame and not self._closed:
             self._calls.violate(ProtocolError("the stream ended inside a frame"))
         why = "the connection ended"

@@ -189,7 +189,7 @@ def candidates(name: str) -> list[str]:
         moments = (now + timedelta(seconds=s) for s in range(60))
         return [DATED.sub(f"{m:%Y-%m-%dT%H%M%S} ", name) for m in moments]
     if NUMBERED.search(name):
-        start, who = next(directory._NUMBERS), f"{os.getpid()}-{name.split('-')[-2]}"
+        start, who = next(directory._TEMPORARY_NUMBERS), f"{os.getpid()}-{name.split('-')[-2]}"
         return [NUMBERED.sub(f"{who}-{start + i}", name) for i in range(200)]
     return [name]
 

@@ -120,4 +120,4 @@ def test_a_system_that_does_not_say_its_memory_is_taken_to_have_some(
 ) -> None:
     monkeypatch.delattr(os, "sysconf")
     monkeypatch.setattr(directory, "CGROUP_LIMIT", tmp_path / "none")
-    assert directory.memory_bytes() == directory.FALLBACK_MEMORY
+    assert directory.memory_bytes() == directory.FALLBACK_MEMORY_BYTES

@@ -104,7 +104,7 @@ def test_new_clients_are_served_whatever_peers_without_the_token_do(
     seed: int, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(tcp.waiting_room, "WAITING", 12)
-    monkeypatch.setattr(tcp, "RESERVED", 3)
+    monkeypatch.setattr(tcp, "RESERVED_PLACES", 3)
     rng = random.Random(seed)
 
     async def main() -> list[bytes]:
@@ -173,7 +173,7 @@ def test_a_client_with_the_token_has_no_place_but_is_served_what_is_urgent() -> 
 def test_clients_beyond_the_reserved_places_displace_the_oldest(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(tcp, "RESERVED", 3)
+    monkeypatch.setattr(tcp, "RESERVED_PLACES", 3)
 
     async def main() -> None:
         server = await serve(App().open, token=TOKEN, limits=ConnectionLimits(max_clients=1))
@@ -241,7 +241,7 @@ def test_without_a_token_a_full_server_serves_estops_however_they_come(
 def test_without_a_token_a_crowd_at_a_full_server_displaces_only_its_own(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(tcp, "RESERVED", 8)
+    monkeypatch.setattr(tcp, "RESERVED_PLACES", 8)
 
     async def main() -> None:
         app = App()

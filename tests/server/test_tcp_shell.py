@@ -558,7 +558,7 @@ def test_one_too_many_is_told_in_its_own_codec_until_there_is_a_place() -> None:
 
 
 def test_many_too_many_are_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tcp, "RESERVED", 3)
+    monkeypatch.setattr(tcp, "RESERVED_PLACES", 3)
 
     async def body(server: TcpServer, app: FakeApp) -> None:
         links = [await dial(server) for _ in range(9)]

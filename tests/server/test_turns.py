@@ -15,7 +15,7 @@ from flexdt.runtime.access import ConnectionLimits
 from flexdt.server.network import tcp
 from flexdt.server.network.loop_turns import FIRST, ORDINARY, URGENT, LoopTurns
 from flexdt.server.network.shell_parts import Peer
-from flexdt.server.network.tcp import READ_AHEAD, TcpServer, _Link
+from flexdt.server.network.tcp import READ_AHEAD_BYTES, TcpServer, _Link
 
 
 class Transport(asyncio.Transport):
@@ -207,11 +207,11 @@ def test_reading_stops_while_enough_waits_and_goes_on_later() -> None:
     async def body(bench: Bench) -> None:
         link, transport = bench.dial()
         line = call("state.get")
-        link.data_received(line * (READ_AHEAD // len(line) + 1))
+        link.data_received(line * (READ_AHEAD_BYTES // len(line) + 1))
         assert not transport.reading
         while bench.app.served == [] or not transport.reading:
             await bench.turn()
-        assert link.wire.pending <= READ_AHEAD // 2
+        assert link.wire.pending <= READ_AHEAD_BYTES // 2
 
     run(body, max_waiting=10**6)
 
@@ -221,7 +221,7 @@ def test_a_message_that_has_begun_is_read_to_its_end() -> None:
         link, transport = bench.dial()
         link.data_received(b'{"jsonrpc":"2.0","id":1,"method":"state.get","params":{"x":"')
         for _ in range(20):
-            link.data_received(b"x" * READ_AHEAD)
+            link.data_received(b"x" * READ_AHEAD_BYTES)
             assert transport.reading
             await bench.turn()
         link.data_received(b'"}}\n' + call("session.ping", 2))
