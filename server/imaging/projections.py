@@ -48,14 +48,14 @@ from flexdt.twin.projection import Body, TriangleMesh
 from flexdt.twin.projection.analytic_solids import Scene
 from flexdt.twin.scanner.state import Sample, StagePlacement
 
-LARGEST = 1e6
-"""Above any value of a truth file [mm, deg]; NaN and infinities are not below it."""
-VERSIONS: Final = 2
-"""Of a sample that the projector keeps."""
-MOST: Final = 64
-"""Samples that stay in memory, however small they are."""
+MAX_TRUTH_VALUE = 1e6
+"""Bound on the values of a truth file [mm, deg]; NaN and infinities are not below it."""
+MAX_VERSIONS: Final = 2
+"""Number of versions of a sample that the projector keeps."""
+MAX_SAMPLES: Final = 64
+"""Largest number of samples in memory, however small they are."""
 Pieces = Literal["part", "material"]
-"""How a sample is taken apart: by what attenuates, or by material."""
+"""How a sample is divided: by what attenuates, or by material."""
 _Key = tuple[str, Pieces]
 
 
@@ -75,11 +75,14 @@ class TrueGeometry:
         return "TrueGeometry(hidden)"
 
     def cone_vec(self, poses: Poses, placement: StagePlacement) -> ConeVec:
-        """True geometry of each pose, in the frame of a sample placed at `placement`.
+        """Compute the true geometry of each pose, in the frame of a sample at `placement`.
 
         Args:
-            poses: nominal.
+            poses: nominal poses, n.
             placement: of the sample.
+
+        Returns:
+            The geometry of n views, which must not leave the server.
         """
         return placement.to_sample(poses.cone_vec(self.__parameters))
 
@@ -109,10 +112,10 @@ def load_truth(path: Path, data: Path) -> TrueGeometry:
     except ValueError:
         raise MachineFileError(f"{path}: not valid TOML", {"file": str(path)}) from None
     for name, value in values.items():
-        if type(value) not in (int, float) or not abs(value) < LARGEST:
+        if type(value) not in (int, float) or not abs(value) < MAX_TRUTH_VALUE:
             raise MachineFileError(
-                f"{path}: {name}: the value must be a number below {LARGEST:g}",
-                {"file": str(path), "path": name, "allowed": [-LARGEST, LARGEST]},
+                f"{path}: {name}: the value must be a number below {MAX_TRUTH_VALUE:g}",
+                {"file": str(path), "path": name, "allowed": [-MAX_TRUTH_VALUE, MAX_TRUTH_VALUE]},
             )
     try:
         parameters = Offsets.from_edge({k: float(v) for k, v in values.items()})
@@ -125,18 +128,18 @@ class Projector(Protocol):
     """The part of the projector's client that projections need."""
 
     async def put(self, name: str, body: Body) -> object:
-        """Name a body."""
+        """Store a body under a name."""
 
     async def remove(self, name: str) -> None:
-        """Forget a body."""
+        """Remove a body."""
 
     async def project(self, name: str, cone_vec: ConeVec, shape: tuple[int, int]) -> Float32Array:
-        """Line integrals, float32 (n, rows, cols)."""
+        """Compute line integrals, float32 (n, rows, cols)."""
 
 
 @dataclass(eq=False)
 class _Apart:
-    """A sample that has been taken apart.
+    """A sample divided into its pieces.
 
     Attributes:
         phantom: it.
@@ -154,7 +157,7 @@ class _Apart:
 
     @property
     def nbytes(self) -> int:
-        """In this process."""
+        """Memory in this process [bytes]."""
         return sum(bytes_of(body) for body in self.bodies)
 
 
@@ -182,7 +185,7 @@ class Imaging:
 
     def __post_init__(self) -> None:
         self._known: dict[_Key, _Apart] = {}
-        """The least recently used first."""
+        """Divided samples, the least recently used first."""
         self._versions: dict[str, list[str]] = {}
         self._scatterer: tuple[Phantom, Object] | None = None
         self._sending = asyncio.Lock()
@@ -195,7 +198,7 @@ class Imaging:
         *,
         truth: TrueGeometry | None = None,
     ) -> Float32Array:
-        """Images of `sample` at n nominal poses.
+        """Compute images of `sample` at n nominal poses.
 
         Args:
             sample, poses, camera: as `Radiography.take` has them.
@@ -230,17 +233,20 @@ class Imaging:
         truth: TrueGeometry | None = None,
         spot: tuple[float, int] = (0.0, 1),
     ) -> tuple[tuple[Channel, ...], Float32Array, FloatArray]:
-        """Paths through each material of `sample` at n nominal poses; arguments as above.
+        """Compute paths through each material of `sample` at n nominal poses.
 
-        `spot` is the focal spot's size [mm] and the number of its points that rays start from: so
-        many views of each pose, one after another.
+        Args:
+            sample, poses, camera, truth: as for `line_integrals`.
+            spot: size of the focal spot [mm] and number of its points from which rays
+                start: so many views of each pose, one after another.
 
         Returns:
-            The materials (m), float32 (m, n, rows, cols) [mm], and the true geometry (n, 12), which
+            The materials (m), float32 (m, n, rows, cols) [mm], and the true geometry (n,
+            12), which
             must not leave the server.
 
         Raises:
-            As `line_integrals`.
+            ProjectorUnavailable, GeometryError: as `line_integrals`.
         """
         cone = (truth or self.truth).cone_vec(poses, sample.offset)
         check_cone_vec(cone, camera.pixels_mm(self.sensor))
@@ -255,7 +261,8 @@ class Imaging:
             return apart.found, out, cone.rows
 
     async def ray(self, sample: Sample, cone: ConeVec) -> dict[str, float]:
-        """Material -> path [mm] to the one pixel of `cone`, n = 1, in the object's frame."""
+        """Compute material -> path [mm] to the one pixel of `cone`, n = 1, in the object's
+        frame."""
         found, paths = await self.nominal_paths(sample, cone.with_shape((1, 1)))
         lengths = paths.sum(axis=(1, 2, 3)).tolist()
         return {part.material.name: x for part, x in zip(found, lengths, strict=True)}
@@ -263,7 +270,7 @@ class Imaging:
     async def nominal_paths(
         self, sample: Sample, cone: ConeVec
     ) -> tuple[tuple[Channel, ...], Float32Array]:
-        """Paths through each material along rays that nothing hidden moves.
+        """Project each material along rays that nothing hidden moves.
 
         Args:
             sample: on the stage, or that a scan is to show.
@@ -283,7 +290,7 @@ class Imaging:
             return apart.found, out
 
     async def nominal_integrals(self, sample: Sample, cone: ConeVec) -> Float32Array:
-        """Line integrals, float32 (n, rows, cols), else as `nominal_paths`."""
+        """Compute line integrals, float32 (n, rows, cols); see `nominal_paths`."""
         views, *grid = cone.shape
         if not sample.name:
             return np.zeros((views, *grid), dtype=np.float32)
@@ -301,7 +308,7 @@ class Imaging:
         return out
 
     async def scatterer(self, sample: Sample, voxels: int) -> Object:
-        """The materials of `sample` on a grid of about so many voxels, made once."""
+        """Sample the materials of `sample` on a grid of about so many voxels, once."""
         async with self._sent(sample, "material") as apart:
             phantom = apart.phantom
             if self._scatterer is None or self._scatterer[0] is not phantom:
@@ -312,7 +319,7 @@ class Imaging:
             return self._scatterer[1]
 
     async def require_room(self, sample: Sample, pieces: Pieces) -> None:
-        """Check that a scan's sample can be held: here, beside what stays in any case, and there.
+        """Check that a scan's sample fits into memory: here, beside what is pinned, and there.
 
         Args:
             sample: that the scan is to show.
@@ -337,6 +344,7 @@ class Imaging:
             raise self._too_large(sample, need, there, there, "the projector")
 
     def _too_large(self, sample: Sample, need: int, left: int, limit: int, who: str) -> RpcError:
+        """Make the error for a sample that needs more memory than is left."""
         error = too_large(f"the sample {sample.name!r} in the memory of {who}", need, max(0, left))
         assert isinstance(error.data, dict)
         error.data.update(sample=sample.name, memory_limit=limit, option="--memory-limit")
@@ -344,11 +352,13 @@ class Imaging:
 
     @asynccontextmanager
     async def _sent(self, sample: Sample, pieces: Pieces) -> AsyncIterator[_Apart]:
-        """The sample, taken apart, and sent to the projector where it is new or has changed.
+        """Divide a sample, send it to the projector where it is new or has changed, and
+        count its user.
 
         Args:
             sample: on the stage.
-            pieces: "part" for what attenuates, (body, factor) each; "material" for channels.
+            pieces: "part" for what attenuates, (body, factor) each; "material" for
+                channels.
         """
         async with self._sending:
             apart = await self._taken_apart(sample, pieces)
@@ -366,7 +376,7 @@ class Imaging:
             apart.users -= 1
 
     async def _taken_apart(self, sample: Sample, pieces: Pieces) -> _Apart:
-        """The sample as it is now, used just now; with `_sending` held."""
+        """Divide the sample as it is now, or reuse its pieces; with `_sending` held."""
         key = (_name(sample), pieces)
         phantom = await asyncio.to_thread(self.samples.load, sample.name, sample.material)
         apart = self._known.pop(key, None)
@@ -382,6 +392,7 @@ class Imaging:
         return apart
 
     async def _send(self, apart: _Apart, name: str, pieces: Pieces) -> None:
+        """Send the pieces of a sample and record their names."""
         whole = pieces == "part" and len(apart.bodies) == 1
         apart.names = [
             await self._put(name if whole else f"{name}, {pieces} {i}", body)
@@ -389,17 +400,18 @@ class Imaging:
         ]
 
     def _pinned_keys(self) -> set[_Key]:
+        """List the keys of samples that stay in memory."""
         names = {_name(sample) for sample in self.pinned()}
         return {key for key in self._known if key[0] in names}
 
     async def _forget_old(self) -> None:
-        """Forget the least recently used samples beyond what may stay; with `_sending` held."""
+        """Drop the least recently used samples beyond the limits; with `_sending` held."""
         stays = self._pinned_keys()
         most = math.inf if self.memory_limit is None else self.memory_limit
         used = sum(apart.nbytes for apart in self._known.values())
         newest = next(reversed(self._known))
         for key, apart in list(self._known.items()):
-            if used <= most and len(self._known) <= MOST:
+            if used <= most and len(self._known) <= MAX_SAMPLES:
                 return
             if key in stays or key == newest or apart.users:
                 continue
@@ -410,11 +422,12 @@ class Imaging:
                 del self._versions[name]
 
     async def _put(self, name: str, body: Body) -> str:
-        """Make sure that the projector has a version of something; its name there."""
+        """Ensure that the projector has the present version of a body; return its name
+        there."""
         named = f"{name} #{await asyncio.to_thread(digest_of, body)}"
         versions = self._versions.setdefault(name, [])
         if named not in versions:
-            await self._remove(name, VERSIONS - 1)
+            await self._remove(name, MAX_VERSIONS - 1)
             try:
                 await self.projector.put(named, body)
             except RpcError as error:
@@ -427,7 +440,7 @@ class Imaging:
         return named
 
     async def _remove(self, name: str, left: int) -> None:
-        """Have the projector forget all but the newest versions."""
+        """Have the projector remove all but the `left` newest versions."""
         versions = self._versions[name]
         while len(versions) > left:
             with suppress(ProjectorUnavailable, RpcError):  # then it may have forgotten more
@@ -436,14 +449,14 @@ class Imaging:
 
 
 def bytes_of(body: Body) -> int:
-    """Memory that a body takes in this process."""
+    """Return the memory that a body takes in this process [bytes]."""
     if isinstance(body, Scene | TriangleMesh):
         return memory_of(body)
     return body.data.nbytes
 
 
 def digest_of(body: Body) -> str:
-    """Of everything that images depend on: equal for equal contents, in every process."""
+    """Hash everything that images depend on: equal for equal contents, in every process."""
     if isinstance(body, Scene):
         sha = hashlib.sha256(json.dumps(scene_to_dict(body), default=np.ndarray.tolist).encode())
     elif isinstance(body, TriangleMesh):
@@ -457,4 +470,5 @@ def digest_of(body: Body) -> str:
 
 
 def _name(sample: Sample) -> str:
+    """Return a sample's name, with its material if it has another one."""
     return sample.name if sample.material is None else f"{sample.name} of {sample.material}"

@@ -26,15 +26,15 @@ from flexdt.twin.projection.analytic_solids import Scene
 
 _T = TypeVar("_T")
 
-CHUNK: Final = 8 * 2**20
+CHUNK_BYTES: Final = 8 * 2**20
 """Bytes of a volume in one message."""
-TRIES: Final = 5
-"""How often a volume is sent that other clients' volumes displace before it is projected."""
+MAX_TRIES: Final = 5
+"""Attempts to send a volume that other clients' volumes displace before it is projected."""
 
 
 @dataclass(eq=False, repr=False)
 class ProjectorClient:
-    """A connection to a projector server that is made anew when it is lost.
+    """A connection to a projector server that is made again when it is lost.
 
     Attributes:
         host, port: of the server.
@@ -52,14 +52,14 @@ class ProjectorClient:
         self._sent: dict[str, Body] = {}
         self._instance: object = None
         self._evicts = False
-        """Whether the server forgets volumes where memory is needed."""
+        """Whether the server drops volumes when memory is needed."""
         self._channel: ProjectorLink | None = None
         self._connecting, self._sending = asyncio.Lock(), asyncio.Lock()
         self._closed = False
 
     @property
     def connected(self) -> bool:
-        """Whether there is a connection at this moment."""
+        """Whether there is a connection now."""
         return self._channel is not None and not self._channel.lost
 
     async def close(self) -> None:
@@ -69,29 +69,31 @@ class ProjectorClient:
             self._channel.close()
 
     async def give(self, name: str, body: Body) -> None:
-        """Make sure that the server has `body` under `name`.
+        """Ensure that the server has `body` under `name`.
 
         Raises:
-            RpcError: -32008, above the server's memory limit; -32602, a mesh that does not close.
+            RpcError: -32008, above the server's memory limit; -32602, a mesh that does
+                not close.
             ProjectorUnavailable: the server does not answer.
         """
         async with self._sending:
             await self._ask("volume.put", lambda channel: self._give(channel, name, body))
 
     async def _give(self, channel: ProjectorLink, name: str, body: Body) -> None:
+        """Send a body unless the server has this very one."""
         if self._sent.get(name) is not body:
             await _send(channel, name, body, {"evictable": True} if self._evicts else {})
             self._sent[name] = body
 
     async def remove(self, name: str) -> None:
-        """Have the server forget what it was given under `name`."""
+        """Have the server remove the body called `name`."""
         if self._sent.pop(name, None) is not None:
             await self.ask("volume.remove", {"name": name})
 
     async def project(
         self, name: str, body: Body | None, cone_vec: ConeVec, shape: tuple[int, int]
     ) -> npt.NDArray[np.float32]:
-        """Line integrals.
+        """Compute line integrals; send the body again if the server has dropped it.
 
         Args:
             name, body: what is projected; None if it is there already.
@@ -109,7 +111,7 @@ class ProjectorClient:
             "volume": name, "cone_vec": image.encode(cone_vec.rows), "detector": list(shape),
         }  # fmt: skip
         whole = (len(cone_vec), *shape)
-        for left in reversed(range(TRIES)):
+        for left in reversed(range(MAX_TRIES)):
             if body is not None:
                 await self.give(name, body)
             try:
@@ -122,14 +124,15 @@ class ProjectorClient:
         raise AssertionError("the last try returns or raises")
 
     async def health(self) -> Health:
-        """The server's version, load and memory."""
+        """Request the server's version, load and memory."""
         return parse_result(Health, await self.ask("health", {}))
 
     async def ask(self, method: str, params: Mapping[str, object]) -> object:
-        """The result of any method; raises as `project`."""
+        """Call any method and return its result; raises as `project`."""
         return await self._ask(method, lambda channel: channel.ask(method, params))
 
     async def _ask(self, method: str, work: Callable[[ProjectorLink], Awaitable[_T]]) -> _T:
+        """Do some work on a connection, made if there is none."""
         async with self._connecting:
             if self._channel is None or self._channel.lost:
                 self._channel = await self._connect()
@@ -142,6 +145,7 @@ class ProjectorClient:
             ) from None
 
     async def _connect(self) -> ProjectorLink:
+        """Connect and introduce the client; a restarted server has no bodies."""
         if self._closed:
             raise ProjectorUnavailable("the projector client is closed")
         try:
@@ -176,7 +180,7 @@ async def _send(channel: ProjectorLink, name: str, value: Body, how: Mapping[str
         shape, voxel = list(value.shape), list(value.voxel_xyz)
         what = {"grid": {"shape": shape, "voxel_mm": voxel, "center_mm": center}}
         flat = np.ascontiguousarray(value.data, dtype="<f4").reshape(-1).view(np.uint8)
-    for start in range(0, flat.size, CHUNK):
-        data = flat[start : start + CHUNK].data.toreadonly()
+    for start in range(0, flat.size, CHUNK_BYTES):
+        data = flat[start : start + CHUNK_BYTES].data.toreadonly()
         params = {"name": name, **what, **how, "start": start, "data": data}
         await channel.ask("volume.put", params)

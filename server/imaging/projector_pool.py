@@ -1,10 +1,10 @@
 """One or several projector servers behind one twin: each request goes to one that is free.
 
-A projector of several holds at most `OPEN` requests, so a fast one, which is free more often, gets
-more of them. One that is lost rests for a while, and its requests go to others, or to itself once
-it has rested. One that takes much longer than it is known for is not given up, but a second one is
-asked as well, and the first answer counts: all projectors of one kind give the same bytes. When the
-pool's patience ends, it raises `ProjectorUnavailable`.
+Each of several projectors holds at most `MAX_OPEN_REQUESTS`, so a fast one, which is free more
+often, gets more of them. One that is lost rests for `REST_S`, and its requests go to others, or to
+itself after that. One that is much slower than usual is not given up, but a second one is asked as
+well, and the first answer counts: all projectors of one kind give the same bytes. When the pool's
+patience ends, it raises `ProjectorUnavailable`.
 """
 
 from __future__ import annotations
@@ -24,13 +24,14 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.projection import Body
 
-OPEN: Final = 2
-"""Requests that a projector has at a time: one is computed while the other travels."""
+MAX_OPEN_REQUESTS: Final = 2
+"""Largest number of requests that a projector has: one is computed while the other travels."""
 REST_S: Final = 1.0
-"""How long one that did not answer is not asked again."""
+"""Time for which a projector that did not answer gets no requests [s]."""
 LATE_S: Final = 1.0
-LATE: Final = 6.0
-"""Times what it usually takes, after LATE_S, before another is asked as well."""
+"""Time after which a request may count as late [s]."""
+LATE_FACTOR: Final = 6.0
+"""Multiple of the usual time, after `LATE_S`, at which another projector is asked as well."""
 
 
 @dataclass(eq=False)
@@ -75,7 +76,7 @@ class ProjectorPool:
 
     @property
     def connected(self) -> bool:
-        """Whether there is a connection to any at this moment."""
+        """Whether there is a connection to any projector now."""
         return any(member.client.connected for member in self._members)
 
     @property
@@ -91,23 +92,26 @@ class ProjectorPool:
             await member.client.close()
 
     async def room(self) -> int | None:
-        """Bytes that the projector with most memory can have for one sample; None if not known."""
+        """Return the memory that the largest projector can have for one sample [bytes];
+        None if not known."""
         found = await asyncio.gather(*map(_room_of, self._members))
         return max((room for room in found if room is not None), default=None)
 
     async def put(self, name: str, body: Body) -> None:
-        """Have one projector take it, which shows that it can be taken; errors as the client's."""
+        """Store a body, and send it to one projector, which shows that it fits; errors as
+        the client's."""
         self._values[name] = body
         await self._deal(name, None, (0, 0))
 
     async def remove(self, name: str) -> None:
-        """Have the projectors forget it; those that do not answer forget it when they restart."""
+        """Have all projectors remove it; those that do not answer lose it when they restart."""
         self._values.pop(name, None)
         removals = (member.client.remove(name) for member in self._members)
         await asyncio.gather(*removals, return_exceptions=True)
 
     async def project(self, name: str, cone_vec: ConeVec, shape: tuple[int, int]) -> Float32Array:
-        """Line integrals, float32 (n, rows, cols); errors as `ProjectorClient.project`."""
+        """Compute line integrals, float32 (n, rows, cols); errors as
+        `ProjectorClient.project`."""
         images = await self._deal(name, cone_vec, shape)
         assert images is not None
         return images
@@ -115,7 +119,16 @@ class ProjectorPool:
     async def _deal(
         self, name: str, views: ConeVec | None, shape: tuple[int, int]
     ) -> Float32Array | None:
-        """The first answer of any projector.
+        """Request something of a free projector, and of another one if it is late; take
+        the first answer.
+
+        Args:
+            name: of the body.
+            views: n views; None sends the body alone.
+            shape: detector (rows, cols).
+
+        Returns:
+            Images, or None without views.
 
         Raises:
             ProjectorUnavailable: none has answered within the patience.
@@ -137,7 +150,7 @@ class ProjectorPool:
                     asked.add(member)
                     asking = self._ask(member, name, value, views, shape)
                     running[self._begin(member, asking)] = member
-                    late = now + LATE_S + LATE * (member.pace_s or 0.0) * len(views or ())
+                    late = now + LATE_S + LATE_FACTOR * (member.pace_s or 0.0) * len(views or ())
                 wakes = [m.rests_until for m in self._members if m.rests_until > now]
                 wakes += [late] if late > now else []
                 done, _ = await asyncio.wait(
@@ -166,8 +179,9 @@ class ProjectorPool:
                 task.cancel()
 
     def _free(self, asked: set[_Member], now: float) -> _Member | None:
-        """Who is asked next: of those that are free the one with least to do, then the fastest."""
-        most = OPEN if len(self) > 1 else math.inf
+        """Choose the next projector: of the free ones that with least to do, then the
+        fastest."""
+        most = MAX_OPEN_REQUESTS if len(self) > 1 else math.inf
         free = (
             m for m in self._members if m not in asked and m.open < most and m.rests_until <= now
         )
@@ -176,13 +190,14 @@ class ProjectorPool:
     def _begin(
         self, member: _Member, asking: Coroutine[Any, Any, Float32Array | None]
     ) -> asyncio.Task[Float32Array | None]:
-        """Ask a projector, in a task that gives its place free however it ends."""
+        """Start a request in a task that releases the projector however it ends."""
 
         def ended(task: asyncio.Task[Float32Array | None]) -> None:
+            """Release the projector and wake a waiting request."""
             self._open.discard(task)
             member.open -= 1
             if not task.cancelled():
-                task.exception()  # of one that came late nobody hears
+                task.exception()  # retrieved, so that asyncio does not log it
             if self._turn is not None and not self._turn.done():
                 self._turn.set_result(None)
 
@@ -200,6 +215,7 @@ class ProjectorPool:
         views: ConeVec | None,
         shape: tuple[int, int],
     ) -> Float32Array | None:
+        """Send a request to one projector; measure its pace, or let it rest after a failure."""
         loop = asyncio.get_running_loop()
         try:
             if member.kind is None:
@@ -223,6 +239,7 @@ class ProjectorPool:
         return images
 
     def _compare(self) -> None:
+        """Warn if projectors differ in version or backend."""
         kinds = sorted({m.kind for m in self._members if m.kind is not None})
         if len(kinds) > 1:
             kept = "; ".join(" ".join(kind) for kind in kinds)
@@ -230,7 +247,8 @@ class ProjectorPool:
 
 
 async def _room_of(member: _Member) -> int | None:
-    """What a projector can have for a sample, by its health; None where it does not say."""
+    """Return the memory that a projector can have for a sample [bytes]; None if it does
+    not answer."""
     try:
         health = await asyncio.wait_for(member.client.health(), LATE_S)
     except (ProjectorUnavailable, RpcError, TimeoutError):

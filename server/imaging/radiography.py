@@ -46,24 +46,26 @@ from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script.planning.sample_findings import SampleProbe, shares_behind
 
 SCATTER: Final = mc.ScatterSettings()
-FORGOTTEN_S: Final = 10.0
-"""Time after which an earlier frame has left nothing on the panel."""
+"""Settings of the scatter simulation."""
+MAX_MEMORY_S: Final = 10.0
+"""Time after which an earlier frame has no effect on the panel [s]."""
 Before = Sequence[tuple[Radiograph, float]]
 """Earlier frames taken with X-rays on, and the time [s] from their ends to this frame's start."""
-BEST: Final = 10
-"""Settings that are proposed."""
-EVERY = 3
-"""Pixels are judged on a grid with this step, edges on all their pixels."""
-SHADOW = 0.05
-"""Line integral on an edge of the image from which the sample counts as cut off."""
+MAX_PROPOSALS: Final = 10
+"""Number of proposed settings."""
+JUDGED_STEP_PX = 3
+"""Step of the grid on which pixels are judged; edges are judged on all their pixels."""
+CUT_OFF_INTEGRAL = 0.05
+"""Line integral at an edge of the image above which the sample counts as cut off."""
 SATURATED, STARVED, CUT_OFF = 1, 2, 4
 """What a pixel's mark is the sum of."""
 
 
 def with_spectra(machine: Machine, physics: Physics) -> Machine:
-    """The machine, its tube held within the voltages that the physics has spectra for.
+    """Restrict a machine's tube to the voltages for which the physics has spectra.
 
-    A voltage without a spectrum is then an error wherever one outside the tube's limits is.
+    A voltage without a spectrum is then an error wherever one outside the tube's limits
+    is.
 
     Raises:
         LimitError: the voltage at start has none.
@@ -106,7 +108,7 @@ class Radiography:
         physics: Physics = "ideal",
         scatter: mc.Scatter = "off",
     ) -> Radiography:
-        """For a machine's tube and detector.
+        """Make the radiography of a machine's tube and detector.
 
         Raises:
             LimitError: ideal physics has no scatter.
@@ -126,11 +128,11 @@ class Radiography:
 
     @property
     def traps(self) -> bool:
-        """Whether it depends on all of them."""
+        """Whether a frame depends on all earlier frames."""
         return self.physics != "ideal" and self.panel.long_lag_fraction > 0.0
 
     def record(self) -> Mapping[str, float]:
-        """The figures of detector and tube by name, for data sets."""
+        """List the figures of detector and tube by name, for data sets."""
         if self.physics == "ideal":
             return {
                 name: float(getattr(self.model, name))
@@ -143,7 +145,7 @@ class Radiography:
         return figures | self.tube.figures()
 
     async def require_room(self, sample: Sample) -> None:
-        """Check that a scan's sample can be held, as `Imaging.require_room`."""
+        """Check that a scan's sample fits into memory, as `Imaging.require_room`."""
         pieces: Pieces = "part" if self.physics == "ideal" else "material"
         await self.imaging.require_room(sample, pieces)
 
@@ -156,7 +158,7 @@ class Radiography:
         *,
         truth: TrueGeometry | None = None,
     ) -> list[Radiograph]:
-        """Images of `sample`, one for each of `exposures`.
+        """Compute radiographs of `sample`, one for each of `exposures`.
 
         Args:
             sample: on the stage.
@@ -208,7 +210,17 @@ class Radiography:
         camera: CameraSettings,
         exposures: Sequence[ExposureSettings],
     ) -> list[Scattered]:
-        """Of each image by its own view alone, so that a scan resumed has the bytes of one."""
+        """Simulate the scatter of each image by its own view alone.
+
+        So a scan that is resumed has the same bytes.
+
+        Args:
+            thing: the sample's voxels.
+            chain: tube, materials, panel.
+            views: (n, 12) cone_vec rows [mm].
+            camera: of all images.
+            exposures: of each image.
+        """
         beams = {kV: mc.Beam.of(chain, kV) for kV in {exposure.kV for exposure in exposures}}
         return [
             mc.view_scatter(thing, view, camera.shape, beams[exposure.kV], SCATTER)
@@ -237,7 +249,7 @@ class Radiography:
         return await asyncio.to_thread(shares_behind, chain, probe, paths, cone.rows)
 
     def dark(self, camera: CameraSettings) -> Radiograph:
-        """An image without X-rays."""
+        """Make the radiograph of an image without X-rays."""
         nothing = np.zeros(camera.shape, dtype=np.float32)
         if self.physics == "ideal":
             return Radiograph(nothing)
@@ -261,7 +273,8 @@ class Radiography:
     def signal(
         self, radiograph: Radiograph, camera: CameraSettings, exposure: ExposureSettings
     ) -> Float32Array:
-        """Expected counts above dark as though X-rays were on, not clipped, (rows, cols)."""
+        """Compute the expected counts above dark as if X-rays were on, not clipped,
+        (rows, cols)."""
         if radiograph.expected is not None:
             return expected_counts(self.panel, camera, radiograph.expected.mean_e)
         lit = replace(exposure, xrays_on=True)
@@ -276,7 +289,19 @@ class Radiography:
         before: Before = (),
         trapped: Float32Array | None = None,
     ) -> ideal.Counts:
-        """What the camera saves of a radiograph, uint16 (rows, cols)."""
+        """Compute the counts that the camera saves of a radiograph.
+
+        Args:
+            radiograph: without noise.
+            camera: mode and region.
+            exposure: tube and time; X-rays off give a dark image.
+            rng: generator of the frame's noise; None for the expectation.
+            before: earlier frames, each with the time since its end [s].
+            trapped: electrons in traps, (rows, cols).
+
+        Returns:
+            uint16 (rows, cols).
+        """
         expected = radiograph.expected
         if expected is None:
             return ideal.expose(self.model, radiograph.integrals, exposure, rng)
@@ -298,7 +323,7 @@ def marks_of(
     exposure: ExposureSettings,
     binning: int = 1,
 ) -> npt.NDArray[np.uint8]:
-    """The same for every pixel: sums of SATURATED, STARVED and CUT_OFF, uint8 (rows, cols).
+    """Mark every pixel with the sum of SATURATED, STARVED and CUT_OFF, uint8 (rows, cols).
 
     Args:
         radiography, radiograph, camera, exposure: as in `flags_of`.
@@ -310,7 +335,7 @@ def marks_of(
     marks += np.where(signal < ideal.FEW_COUNTS, STARVED, 0)
     edge = np.ones(lines.shape, np.bool_)
     edge[1:-1, 1:-1] = False
-    marks += np.where(edge & (lines > SHADOW), CUT_OFF, 0)
+    marks += np.where(edge & (lines > CUT_OFF_INTEGRAL), CUT_OFF, 0)
     rows, cols = (n // binning for n in lines.shape)
     # Surplus rows and columns are cut off, as `binned_mean` does: their marks go to the last kept.
     small = marks[: rows * binning, : cols * binning].astype(np.uint8)
@@ -328,7 +353,8 @@ def flags_of(
     exposure: ExposureSettings,
     time: float | None = None,
 ) -> ImageFlags:
-    """Saturated and starved parts of an image, where they begin, and edges that cut the sample off.
+    """Compute the saturated and starved parts of an image, their bounds, and the edges
+    that cut the sample off.
 
     Args:
         radiography: how images are made.
@@ -337,10 +363,12 @@ def flags_of(
         time: of its pose [s].
     """
     lines = radiograph.shown
-    signal = radiography.signal(radiograph, camera, exposure)[::EVERY, ::EVERY]
+    signal = radiography.signal(radiograph, camera, exposure)[::JUDGED_STEP_PX, ::JUDGED_STEP_PX]
     top = radiography.saturating
     # The signal of an open beam, as a logarithm. Two digits: with more, poly would tell distances.
-    beam = float(np.median(lines[::EVERY, ::EVERY] + np.log(np.maximum(signal, 1e-30))))
+    beam = float(
+        np.median(lines[::JUDGED_STEP_PX, ::JUDGED_STEP_PX] + np.log(np.maximum(signal, 1e-30)))
+    )
     edges: dict[ImageEdge, Float32Array] = {
         "left": lines[:, 0],
         "right": lines[:, -1],
@@ -351,14 +379,14 @@ def flags_of(
         time=time,
         saturated=float(np.mean(signal >= top)),
         starved=float(np.mean(signal < ideal.FEW_COUNTS)),
-        truncated=[name for name, edge in edges.items() if float(edge.max()) > SHADOW],
+        truncated=[name for name, edge in edges.items() if float(edge.max()) > CUT_OFF_INTEGRAL],
         good_counts=(radiography.offset + ideal.FEW_COUNTS, radiography.full_scale),
         good_lines=(round(beam - math.log(top), 2), round(beam - math.log(ideal.FEW_COUNTS), 2)),
     )
 
 
 def predictors() -> Workers:
-    """The process that predicts; to be closed in the end."""
+    """Make the worker process that predicts; the caller closes it."""
     limits = PREDICTION_LIMITS
     return Workers(1, int(limits["memory_bytes"]), float(limits["seconds"]))
 
@@ -366,13 +394,26 @@ def predictors() -> Workers:
 def predict(
     phantom: Phantom, machine: Machine, settings: dict[str, Any], codec: Codec
 ) -> list[bytes]:
-    """In the worker: the answer to `exposure.predict`, encoded; `settings` are `expose`'s.
+    """Answer `exposure.predict`, in the worker.
+
+    Args:
+        phantom: the sample.
+        machine: the twin's.
+        settings: arguments of `expose`.
+        codec: of the answer.
+
+    Returns:
+        The encoded answer.
 
     Raises:
         RpcError: an argument that the machine does not allow.
     """
     told = asdict(exposure_forecast.expose(phantom, machine=machine, **settings))
     told["transmission"]["edges"] = told["transmission"]["edges"][:-1]  # no infinity in JSON
-    told |= {"sample": phantom.name, "best": told["best"][:BEST], "frames": told.pop("images")}
+    told |= {
+        "sample": phantom.name,
+        "best": told["best"][:MAX_PROPOSALS],
+        "frames": told.pop("images"),
+    }
     result = ExposurePrediction.model_validate(told, strict=False)
     return list(encoded(result, codec).pieces)

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.server.imaging.radiography import FORGOTTEN_S, Before, Radiography
+from flexdt.server.imaging.radiography import MAX_MEMORY_S, Before, Radiography
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.physics.chain import Radiograph
@@ -105,7 +105,7 @@ class Acquisition:
         for index in range(max(0, frame.index - REMEMBERED), frame.index):
             earlier = self.plan.exposures[index]
             gap = frame.start_s - earlier.start_s - earlier.duration_s
-            if earlier.xrays_on and earlier.camera == frame.camera and gap < FORGOTTEN_S:
+            if earlier.xrays_on and earlier.camera == frame.camera and gap < MAX_MEMORY_S:
                 found.append((await self._image(earlier), gap))
         return found
 

@@ -28,13 +28,13 @@ from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.geometry.offsets import Offsets, require_plausible
 from flexdt.twin.scanner.state import NamedCorrection
 
-KEPT = 1000
-"""Corrections put in force that `revert` can go back through."""
+MAX_HISTORY = 1000
+"""Number of corrections through which `revert` can go back."""
 
 History = list[str | None]
 HISTORY = "history"
-"""File of the history: a JSON list of names, null for nominal."""
-_NAMES: TypeAdapter[History] = TypeAdapter(History)
+"""File name of the history: a JSON list of names, null for nominal."""
+_HISTORY_TYPE: TypeAdapter[History] = TypeAdapter(History)
 
 
 class CorrectionFile(p.CorrectionPart):
@@ -72,14 +72,14 @@ class Corrections:
         before = own.read_or_set_aside(folder, HISTORY, _read_history, without)
         known = _joined(before or [], list(in_force))
         self.filed = before is not None or len(known) < 2
-        """Whether the history has a file; without one it is kept in the state."""
+        """Whether the history has a file; without one it is part of the state."""
         self.lost: str | None = None
-        """The correction that was in force and is not there any more."""
+        """Name of a correction that was in force and has been lost."""
         if known and known[-1] is not None and known[-1] not in self._all:
             self.lost = known[-1]
             known.append(None)
         self._written: History | None = None
-        """The history that was written last."""
+        """History that was written last."""
         self._history: History = [name for name in known if name is None or name in self._all]
 
     @property
@@ -93,11 +93,11 @@ class Corrections:
         self.filed = self.filed or self._written == names
 
     def all(self) -> list[NamedCorrection]:
-        """Every correction, oldest first."""
+        """List every correction, oldest first."""
         return sorted(self._all.values(), key=lambda c: c.date)
 
     def source(self, name: str) -> str | None:
-        """What the correction called `name` came from."""
+        """Return the origin of the correction called `name`."""
         return self._sources.get(name)
 
     @property
@@ -106,12 +106,12 @@ class Corrections:
         return self.last(self.history)
 
     def last(self, history: History) -> NamedCorrection | None:
-        """The correction in force after `history`."""
+        """Return the correction in force after `history`."""
         name = history[-1] if history else None
         return None if name is None else self._all[name]
 
     def get(self, name: str) -> NamedCorrection:
-        """The correction called `name`.
+        """Look up the correction called `name`.
 
         Raises:
             UnknownNameError: lists the names there are.
@@ -125,7 +125,7 @@ class Corrections:
     def make(
         self, values: Mapping[str, float], name: str | None, note: str, when: datetime | None = None
     ) -> NamedCorrection:
-        """A new correction from edge values [mm, deg]; nothing is stored yet.
+        """Make a correction from edge values [mm, deg]; nothing is stored yet.
 
         Raises:
             UnknownNameError: a name that is not a parameter.
@@ -150,14 +150,14 @@ class Corrections:
         return self._all.get(chosen) or NamedCorrection(chosen, date, parameters, note)
 
     def after(self, correction: NamedCorrection | None) -> History:
-        """The history once `correction` is in force instead of the last."""
+        """Return the history once `correction` is in force instead of the last."""
         name = None if correction is None else correction.name
         if name is None and self.in_force is None:
             return self.history
-        return [*self.history, name][-KEPT:]
+        return [*self.history, name][-MAX_HISTORY:]
 
     def store(self, changes: own.Changes, correction: NamedCorrection, source: str | None) -> None:
-        """Write a new correction; one that is known stays as it is.
+        """Write a new correction; a known one stays as it is.
 
         Raises:
             DatasetWriteError: the system cannot write.
@@ -169,17 +169,19 @@ class Corrections:
         changes.put_json(self._folder, name, document.model_dump(by_alias=True))
 
     def know(self, correction: NamedCorrection, source: str | None) -> None:
-        """Add a correction, with what it came from, to those that there are."""
+        """Register a correction and its origin, unless it is known."""
         if correction.name not in self._all:
             self._all[correction.name] = correction
             self._sources[correction.name] = source
 
     def in_state(self, history: History) -> History:
-        """What the state has of a history: what is in force, or all where it has no file."""
+        """Return the part of a history that the state has: what is in force, or all if it
+        has no file."""
         return history[-1:] if self.filed else history
 
     def store_history(self, changes: own.Changes, history: History) -> None:
-        """Write the history; on a full disk it stays as it was, which costs steps of `revert` only.
+        """Write the history; on a full disk it stays as it was, which costs steps of
+        `revert` only.
 
         Raises:
             DatasetWriteError: the system cannot write.
@@ -189,7 +191,7 @@ class Corrections:
             self._written = history
 
     def without(self, name: str) -> History:
-        """The history once the correction called `name` is deleted.
+        """Return the history once the correction called `name` is deleted.
 
         Raises:
             UnknownNameError: there is no such correction.
@@ -208,13 +210,14 @@ class Corrections:
         changes.remove(self._folder, self._files.get(name) or _file(self._all[name]))
 
     def forget(self, name: str, history: History) -> None:
-        """Know a correction no longer; `history` is without it."""
+        """Remove a correction from memory; `history` is without it."""
         del self._all[name]
         self._sources.pop(name, None)
         self._files.pop(name, None)
         self.history = history
 
     def _free_name(self, date: str) -> str:
+        """Find an unused name for a correction of this date."""
         base = f"correction-{date[:10]}"
         taken = sum(name.startswith(base) for name in self._all)
         while (name := f"{base}-{taken + 1}") in self._all:
@@ -223,12 +226,13 @@ class Corrections:
 
 
 def _file(correction: NamedCorrection) -> str:
+    """Return the file name of a correction."""
     stamp = correction.date.split(".")[0].replace(":", "")
     return f"{stamp} {own.file_stem(correction.name)}.json"
 
 
 def _joined(before: History, in_force: History) -> History:
-    """The history by its file and by the state, of which the state is right."""
+    """Join the history of the file and that of the state, which takes precedence."""
     if len(in_force) != 1:
         return in_force
     [name] = in_force
@@ -237,10 +241,12 @@ def _joined(before: History, in_force: History) -> History:
 
 
 def _read_history(data: bytes) -> History:
-    return _NAMES.validate_python(own.read_json(data), strict=True)[-KEPT:]
+    """Parse the history."""
+    return _HISTORY_TYPE.validate_python(own.read_json(data), strict=True)[-MAX_HISTORY:]
 
 
 def _read(data: bytes) -> tuple[NamedCorrection, str | None]:
+    """Parse a correction and its origin, and check that it is plausible."""
     document = CorrectionFile.model_validate(own.read_json(data))
     correction = correction_of(document)
     require_plausible(correction.parameters, math.inf)

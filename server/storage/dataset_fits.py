@@ -17,16 +17,20 @@ from flexdt.runtime.wire_errors import from_root
 from flexdt.twin.dataset.dataset_errors import DatasetMissingError
 from flexdt.twin.dataset.file_names import plain_name
 
-SECONDS: Final = float(p.FIT_LIMITS["seconds"])
-MEMORY_BYTES: Final = int(p.FIT_LIMITS["memory_bytes"])
-FILES: Final = (".toml", ".json")
+MAX_SECONDS: Final = float(p.FIT_LIMITS["seconds"])
+MAX_MEMORY_BYTES: Final = int(p.FIT_LIMITS["memory_bytes"])
+PHANTOM_SUFFIXES: Final = (".toml", ".json")
 
 
 def fit(root: Directory, asked: p.CalibrationFit, *_: object) -> p.CalibrationFitResult:
-    """Calibrate; blocks.
+    """Calibrate from data sets; blocks.
 
     Raises:
         TwinError: there is no such data set or phantom, or nothing can be fitted.
+
+    Args:
+        root: the data directory.
+        asked: parameters of `calibration.fit`.
     """
     # Here, as only workers fit: the server's own process loads nothing of it.
     from flexdt.library.analysis import calibrate
@@ -35,7 +39,7 @@ def fit(root: Directory, asked: p.CalibrationFit, *_: object) -> p.CalibrationFi
     from flexdt.twin.calibration.unknown_markers import UNKNOWN
 
     phantom: Any = asked.phantom
-    if not is_shipped(phantom) and Path(phantom).suffix in FILES:
+    if not is_shipped(phantom) and Path(phantom).suffix in PHANTOM_SUFFIXES:
         phantom = load_phantom_file(_text(root, phantom), phantom)
     elif phantom != UNKNOWN and not is_shipped(phantom):
         load_phantom(phantom)  # says which there are
@@ -66,7 +70,7 @@ def fit(root: Directory, asked: p.CalibrationFit, *_: object) -> p.CalibrationFi
 
 
 def align(root: Directory, asked: p.CalibrationAlign, *_: object) -> p.CalibrationAlignResult:
-    """Align; blocks. Raises as `fit`."""
+    """Align a data set; blocks. Raises as `fit`."""
     from flexdt.library.analysis import align as align_data_set
 
     found = align_data_set(_there(root, asked.name), per_frame=asked.per_frame)
@@ -74,13 +78,14 @@ def align(root: Directory, asked: p.CalibrationAlign, *_: object) -> p.Calibrati
 
 
 def _there(root: Directory, name: str) -> Path:
+    """Return the folder of a data set, or raise DatasetMissingError."""
     if not root.is_directory(plain_name(name, "data set")):
         raise DatasetMissingError(f"no data set {name!r} in the data directory", {"asked": name})
     return root.path / name
 
 
 def _text(root: Directory, name: str) -> str:
-    """Of a phantom file, which names no files of its own."""
+    """Read a phantom file of the data directory, which may name no other files."""
     if plain_name(name, "phantom") not in root.names():
         raise DatasetMissingError(f"no phantom {name!r} in the data directory", {"asked": name})
     return read_text(root.path / name)

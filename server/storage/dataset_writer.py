@@ -26,6 +26,7 @@ from flexdt.twin.dataset.file_names import DOCUMENT, SCRIPT, plain_name
 from flexdt.twin.dataset.flexdt_json import DatasetDocument, ScanRecord
 
 INTERRUPTED: Final = "the scan has not finished"
+"""Reason for which an unfinished data set is incomplete."""
 
 
 class DatasetWriter:
@@ -76,13 +77,13 @@ class DatasetWriter:
 
     @property
     def present(self) -> frozenset[str]:
-        """Names of the images that are there, whole."""
+        """Names of the complete images in the folder."""
         with self._lock:
             return frozenset(self._present)
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Names of the images that are not there, in the order taken."""
+        """Names of the missing images, in the order taken."""
         there = self.present
         return tuple(dict.fromkeys(f for f in self.record.files if f not in there))
 
@@ -134,14 +135,15 @@ class DatasetWriter:
         self._end(True, "", duration_s)
 
     def mark_incomplete(self, reason: str, *, duration_s: float | None = None) -> None:
-        """Say in all texts that and why the scan did not finish."""
+        """Write into all texts that and why the scan did not finish."""
         self._end(False, reason, duration_s)
 
     def close(self) -> None:
-        """Give the folder back; the data set stays as it is marked."""
+        """Close the folder; the data set stays as it is marked."""
         self._files.close()
 
     def _begin(self, resume: bool) -> set[str]:
+        """Check the folder, and return the names of its complete images."""
         there = self._files.names()
         if there and not resume:
             raise ds.DatasetExistsError(
@@ -155,7 +157,8 @@ class DatasetWriter:
         return {name for name in found if self._whole(name)}
 
     def _whole(self, name: str) -> bool:
-        """Whether the file holds an image of the right format (only its header is read)."""
+        """Return whether the file holds an image of the right format (only its header is
+        read)."""
         try:
             with self._files.open(name) as file, tifffile.TiffFile(file) as tiff:
                 page = tiff.pages[0]
@@ -169,6 +172,7 @@ class DatasetWriter:
             return False
 
     def _check_same(self) -> None:
+        """Check that the folder holds this scan; take over its start and its correction."""
         path = self.folder / DOCUMENT
         try:
             found = read_document(self._files)
@@ -195,6 +199,7 @@ class DatasetWriter:
         )
 
     def _check_room(self) -> None:
+        """Check that the missing images fit on the disk."""
         missing = self.missing
         need = sum(2 * self._shapes[f][0] * self._shapes[f][1] for f in missing) + RESERVE_BYTES
         free = free_bytes(self.folder)
@@ -205,6 +210,7 @@ class DatasetWriter:
             )
 
     def _end(self, complete: bool, reason: str, duration_s: float | None) -> None:
+        """Write the texts with the end of the scan, after the images are safe on the disk."""
         length = self.record.duration_s if duration_s is None else duration_s
         self._files.sync()  # no power cut leaves a complete data set without its images
         self.record = replace(self.record, complete=complete, reason=reason, duration_s=length)
@@ -213,7 +219,7 @@ class DatasetWriter:
 
 
 def summary(names: Collection[str]) -> str:
-    """The first names, and how many more."""
+    """List the first five names and the number of others."""
     first = list(names)[:5]
     more = len(names) - len(first)
     return ", ".join(first) + (f" and {more} more" if more else "")

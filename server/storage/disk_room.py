@@ -20,16 +20,16 @@ from flexdt.runtime.files.directory import Directory, free_bytes
 from flexdt.twin.dataset.dataset_errors import DiskFullError
 
 RESERVE_BYTES: Final = 16 << 20
-"""Left free by what is about to begin: for texts, documents and the file system's own needs."""
-SETTLED_NS: Final = 2 * 10**9
-"""After which a folder's time of change tells whether it has changed since it was read."""
+"""Room that new scans and uploads leave free: for texts, documents and the file system."""
+MIN_SETTLED_NS: Final = 2 * 10**9
+"""Age from which a folder's time of change shows every change [ns]."""
 LAST_BYTES: Final = 4 << 20
-"""Left free by each image and each part of an upload."""
+"""Room that each image and each part of an upload leaves free."""
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """A folder as it was: its time of change, bytes of its own files, and its folders."""
+    """State of a folder: its time of change, bytes of its own files, and its folders."""
 
     changed_ns: int
     nbytes: int
@@ -48,7 +48,7 @@ class UsedBytes:
         self._seen: dict[str, _Seen] = {}
 
     def count(self) -> int:
-        """Bytes of all files in it and its folders; links are not followed."""
+        """Sum up the bytes of all files in it and its folders; links are not followed."""
         with suppress(OSError):
             changed_ns = os.stat(self._root.fileno() or self._root.path).st_mtime_ns
             there: dict[str, _Seen] = {}
@@ -58,9 +58,10 @@ class UsedBytes:
         return 0
 
     def _count(self, folder: Directory, name: str, changed_ns: int, there: dict[str, _Seen]) -> int:
+        """Sum up a folder, reusing what is known of unchanged ones; record them in `there`."""
         seen = self._seen.get(name)
         # A change within the clock's grain does not show: what is young is read again.
-        old = time.time_ns() - changed_ns > SETTLED_NS
+        old = time.time_ns() - changed_ns > MIN_SETTLED_NS
         if seen is None or seen.changed_ns != changed_ns or not old:
             seen = _read(folder, changed_ns)
         there[name] = seen
@@ -75,6 +76,7 @@ class UsedBytes:
 
 
 def _read(folder: Directory, changed_ns: int) -> _Seen:
+    """Read a folder's files and folders."""
     nbytes, folders = 0, list[str]()
     with folder.entries() as entries:
         for entry in entries:
@@ -104,7 +106,7 @@ class DiskRoom:
         return UsedBytes(self.root)
 
     def require(self, what: str, size: int, there: int = 0) -> None:
-        """Refuse what the disk cannot hold, or the quota does not allow.
+        """Check that the disk and the quota have room.
 
         Args:
             what: that is about to begin.
@@ -128,7 +130,7 @@ class DiskRoom:
 
 
 def require_last(folder: Path, what: str, size: int) -> None:
-    """Refuse what would leave no room for what must be written.
+    """Check that writing leaves room for the state.
 
     Args:
         folder: on the disk.

@@ -23,9 +23,9 @@ from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 from flexdt.twin.dataset.file_names import plain_name
 
 RECORDS = "jobs"
-"""The folder of what scans start from."""
+"""Name of the folder of what scans start from."""
 FOLDER = "status"
-"""The folder of these files in it."""
+"""Name of the folder of these files in it."""
 NUMBERED = re.compile(r"job-(\d{1,15})")
 
 Seconds = Annotated[float, Ge(0), Le(1e12)]
@@ -33,7 +33,7 @@ Count = Annotated[int, Ge(0), Le(2**53)]
 
 
 class JobMemory(BaseModel):
-    """One job as it was.
+    """Stored state of a job.
 
     Attributes:
         ended: when it ended, by the server's calendar; None while it has not.
@@ -79,7 +79,7 @@ class JobFiles:
         self._folder = self._records.folder(FOLDER)
 
     def read(self) -> list[JobMemory]:
-        """Every job in the order made; files that cannot be read are set aside."""
+        """Read every job in the order made; set aside files that cannot be read."""
         found = []
         for file in own.ours(self._folder):
             without = "a job cannot be read; without it (its data set stays)"
@@ -98,11 +98,11 @@ class JobFiles:
         changes.put(self._folder, _file(job.id), _text(job))
 
     def remove(self, changes: own.Changes, job: str) -> None:
-        """Forget a job, among other changes; nothing to do where there is no file."""
+        """Delete a job's file, among other changes; none there is no error."""
         changes.remove(self._folder, _file(job))
 
     def write(self, name: str, job: JobMemory | None) -> None:
-        """Write a job that has changed; None forgets it.
+        """Write a job that has changed; None deletes its file.
 
         Raises:
             DatasetWriteError: the system refuses.
@@ -114,35 +114,39 @@ class JobFiles:
             self._folder.keep(_file(name), _text(job))
 
     def clear(self) -> None:
-        """Forget every job."""
+        """Delete the file of every job."""
         for file in own.ours(self._folder):
             with suppress(DatasetWriteError):
                 self._folder.discard(file)
 
     def settle(self) -> None:
-        """At the start: delete what killed writers left; what is no folder is set aside."""
+        """Clean the folders at the start: delete what killed writers left; set aside what
+        is no folder."""
         own.settle(self._records, [FOLDER])
 
 
 def number_of(job: str) -> int:
-    """The number in a job's name; 0 for a name that is none of ours."""
+    """Return the number in a job's name; 0 for a name of another form."""
     match = NUMBERED.fullmatch(job)
     return 0 if match is None else int(match[1])
 
 
 def _file(job: str) -> str:
+    """Return the file name of a job."""
     return f"{own.file_stem(job)}.json"
 
 
 def _text(job: JobMemory) -> bytes:
+    """Encode a job."""
     document = JobFile(schema=1, **job.model_dump())
     return document.model_dump_json(by_alias=True, indent=1).encode("utf-8")
 
 
 def _reader(file: str) -> Callable[[bytes], JobMemory]:
-    """Reads a job's file, which must be about the job that its name says."""
+    """Make the reader of a job's file, which must be about the job in its name."""
 
     def read(data: bytes) -> JobMemory:
+        """Parse a job and check its name."""
         found = JobFile.model_validate(own.read_json(data))
         if file != _file(found.id):
             raise ValueError(f"it is about {found.id!r}")

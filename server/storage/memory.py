@@ -40,13 +40,13 @@ from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.scanner.state import Sample
 
 FILE = "state.json"
-INTERVAL_S = 0.25
-"""Real seconds between two writes, at least."""
+MIN_INTERVAL_S = 0.25
+"""Shortest time between two writes [s of real time]."""
 ChangedJobs = dict[str, JobMemory | None]
-JOBS_A_TURN = 200
-"""Jobs that are written while other changes wait."""
+MAX_JOBS_PER_TURN = 200
+"""Largest number of jobs that are written while other changes wait."""
 FAR_S = 60.0
-"""After a write that failed (a full disk), the next one waits so long [s]."""
+"""Pause after a failed write (a full disk) [s]."""
 
 T = TypeVar("T")
 
@@ -85,7 +85,7 @@ def remember(
     unfiled: Sequence[JobMemory] = (),
     ended: bool = False,
 ) -> Memory:
-    """The scanner at twin time `now`: where its motors are, not where they are bound.
+    """Record the scanner at twin time `now`: where its motors are, not where they are bound.
 
     Args:
         scanner: as it is.
@@ -111,7 +111,7 @@ def remember(
 def as_of(
     memory: Memory, scanner: ScannerTwin, corrections: list[str | None] | None = None
 ) -> Memory:
-    """The document with the settings, sample and correction of `scanner`.
+    """Replace the settings, sample and correction of the document by those of `scanner`.
 
     Args:
         memory: as it is; its positions stay.
@@ -124,7 +124,7 @@ def as_of(
 
 
 def read_memory(root: Directory) -> Memory | None:
-    """What was remembered in data directory `root`; None where there is nothing to read."""
+    """Read the state of data directory `root`; None if there is none, or a damaged one."""
     return own.read_or_set_aside(
         root,
         FILE,
@@ -134,9 +134,17 @@ def read_memory(root: Directory) -> Memory | None:
 
 
 def restore(memory: Memory, scanner: ScannerTwin, now: float) -> Sample | None:
-    """Put the scanner where `memory` has it, X-rays off; returns the sample, to be put on.
+    """Set the scanner to the state in `memory`, X-rays off; an E-stop stays in force.
 
-    None where the memory is of another machine or no longer allowed: then only an E-stop is kept.
+    Args:
+        memory: the state.
+        scanner: to be set.
+        now: twin time [s].
+
+    Returns:
+        The sample to put on the stage; None if the state is of another machine or not
+        allowed any
+        more, so that only the E-stop is restored.
     """
     known: p.Scene | None
     known, spec = memory.scene, scanner.machine.tube
@@ -161,18 +169,18 @@ def restore(memory: Memory, scanner: ScannerTwin, now: float) -> Sample | None:
 
 
 class JobsNotWrittenError(DatasetWriteError):
-    """The state has been written, but not each job that has changed."""
+    """The state has been written, but not every job that has changed."""
 
 
 class StateStore:
-    """Writes the memory while the server runs.
+    """Writes the state while the server runs.
 
     Args:
         root: the data directory.
-        make: makes the document.
-        job_files: where jobs are written.
-        changed_jobs: takes the jobs that have changed since it was called last, None for one that
-            is forgotten.
+        make: makes the document; its argument says whether the server ends.
+        job_files: writes jobs.
+        changed_jobs: returns the jobs that have changed since its last call, None for one
+            that is forgotten.
     """
 
     def __init__(
@@ -187,16 +195,16 @@ class StateStore:
         self._unwritten: ChangedJobs = {}
         self._spares = SpareFiles(root)
         self.problem: str | None = None
-        """Why the last change that did not wait for the disk is not on it; None where it is."""
+        """Why the last change that did not wait for the disk is not on it, or None."""
         self.noticed: Callable[[str | None], None] = lambda problem: None
-        """Called when there is a problem, and with None when there is none any more."""
+        """Called when there is a problem, and with None when it is over."""
         self._changed, self._at_once = asyncio.Event(), asyncio.Event()
         self._writing = asyncio.Lock()
         self._file = threading.Lock()
         self._ended = False
 
     def changed(self, *, at_once: bool = False) -> None:
-        """Something worth remembering has changed; `at_once` is for what no pause may hold back."""
+        """Schedule a write after a change; `at_once` skips the pause."""
         self._changed.set()
         if at_once:
             self._at_once.set()
@@ -208,7 +216,7 @@ class StateStore:
                 await self._changed.wait()
             self._changed.clear()
             self._at_once.clear()
-            pause = INTERVAL_S
+            pause = MIN_INTERVAL_S
             try:
                 await self.flush()
             except JobsNotWrittenError as error:
@@ -248,14 +256,15 @@ class StateStore:
         """Write a change that must survive, then apply it.
 
         Args:
-            take: makes the change, once it is on the disk; if it raises, what was written is as it
-                was before.
-            after: the document with the change, from the one without; what it raises leaves
-                everything as it is. None where the document has nothing of it.
+            take: makes the change, once it is on the disk; if it raises, what was written
+                is as it was before.
+            after: the document with the change, from the one without; what it raises
+                leaves everything as it is. None where the document has nothing of it.
             files: writes what the change needs besides, before the document.
 
         Raises:
-            DatasetWriteError: the system cannot write; nothing has changed, here or on the disk.
+            DatasetWriteError: the system cannot write; nothing has changed, here or on
+                the disk.
         """
         # A requester that disconnects does not interrupt a write: it succeeds or is undone.
         return await asyncio.shield(asyncio.ensure_future(self._keep(take, after, files)))
@@ -266,6 +275,7 @@ class StateStore:
         after: Callable[[Memory], Memory] | None,
         files: Callable[[own.Changes], None] | None,
     ) -> T:
+        """Write a change, apply it, and restore the disk if either fails."""
         async with self._writing:
             document = None if after is None else after(self._make(False))
             changes = own.Changes()
@@ -280,28 +290,28 @@ class StateStore:
             return taken
 
     def _note(self, problem: str | None) -> None:
-        """Say so where the first change since one that was written is not on the disk."""
+        """Report a problem with the disk when it begins or ends."""
         before, self.problem = self.problem, problem
         if (before is None) != (problem is None):
             self.noticed(problem)
 
     def end(self) -> None:
-        """Write for the last time; a write that is still on its way does not undo it."""
+        """Write for the last time; a write still under way does not undo it."""
         try:
             self._put(self._make(True), self._unwritten_jobs(most=sys.maxsize))
         except (OSError, DatasetError) as error:
             log("the state was not written", logging.ERROR, reason=str(error))
 
     def owe(self, jobs: Sequence[JobMemory]) -> None:
-        """Write these jobs with the next change."""
+        """Add jobs to those that the next change writes."""
         self._unwritten |= {job.id: job for job in jobs}
 
     def is_unwritten(self, job: str) -> bool:
-        """Whether a change of a job is still to be written."""
+        """Return whether a change of a job is still to be written."""
         return job in self._unwritten
 
-    def _unwritten_jobs(self, most: int = JOBS_A_TURN) -> ChangedJobs:
-        """Jobs to write: those that have changed now, then those left from before.
+    def _unwritten_jobs(self, most: int = MAX_JOBS_PER_TURN) -> ChangedJobs:
+        """List the jobs to write: those that have changed now, then earlier ones.
 
         Thousands may be forgotten at once; then requests are served between turns.
         """
@@ -310,6 +320,7 @@ class StateStore:
         return now | dict(islice(self._unwritten.items(), max(0, most - len(now))))
 
     def _put(self, memory: Memory, jobs: ChangedJobs) -> None:
+        """Write the document and jobs, unless the server has ended."""
         # Ending cancels the task that waits for a worker thread, but not the thread.
         with self._file:
             if self._ended and not memory.ended:
@@ -320,6 +331,7 @@ class StateStore:
                 self._put_job(name, job)
 
     def _put_job(self, name: str, job: JobMemory | None) -> None:
+        """Write a job, and remove it from the unwritten ones unless it has changed again."""
         try:
             self._job_files.write(name, job)
         except DatasetWriteError as error:
@@ -333,6 +345,7 @@ class StateStore:
         document: Memory | None,
         files: Callable[[own.Changes], None] | None,
     ) -> None:
+        """Write files and the document as undoable changes."""
         with self._file:
             if self._ended:
                 raise DatasetWriteError("the server is ending; nothing has changed")
@@ -342,16 +355,18 @@ class StateStore:
                 changes.put(self._root, FILE, _text(document), self._spares.keep)
 
     def _undo(self, changes: own.Changes) -> None:
+        """Undo the changes."""
         with self._file:
             changes.undo()
 
 
 def _text(memory: Memory) -> bytes:
+    """Encode the document."""
     without = set() if memory.jobs else {"jobs"}
     return memory.model_dump_json(by_alias=True, exclude=without).encode("utf-8")
 
 
 def _within(machine: Machine, positions: Mapping[str, float]) -> dict[str, float]:
-    """Positions without the rounding errors of a motion seen in mid-flight."""
+    """Move positions into the travel: a motion in mid-flight has rounding errors."""
     axes = machine.axes
     return {name: min(max(x, axes[name].lower), axes[name].upper) for name, x in positions.items()}

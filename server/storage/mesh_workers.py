@@ -23,26 +23,28 @@ MEMORY_BYTES = 3 << 30
 
 
 def mesh_apart(raw: bytes, *, unit: str, material: str, file_type: str, name: str) -> Phantom:
-    """`flexdt.phantoms.mesh_phantom` of a stranger's bytes; blocks, so call it from a thread.
+    """Read a mesh from untrusted bytes, as `flexdt.phantoms.mesh_phantom`; blocks.
 
     Raises:
-        PhantomError: as there, unknown material, or reading it takes too much time or memory.
+        PhantomError: as there, unknown material, or reading it takes too much time or
+            memory.
     """
     how = {"unit": unit, "material": material, "file_type": file_type, "name": name}
     return _apart(phantoms.mesh_phantom, how, raw)
 
 
 def scene_apart(raw: bytes, *, name: str) -> Phantom:
-    """The phantom of a stranger's phantom or scene file (TOML or JSON), as `mesh_apart`.
+    """Read an untrusted phantom or scene file (TOML or JSON), as `mesh_apart`.
 
     Raises:
-        PhantomError: its content does not hold, it is larger than is allowed, names files or an
-            unknown material, or reading it takes too much time or memory.
+        PhantomError: its content does not hold, it is larger than is allowed, names files
+            or an unknown material, or reading it takes too much time or memory.
     """
     return _apart(sent_scene, {"name": name}, raw)
 
 
 def _apart(read: Callable[..., Phantom], how: dict[str, str], raw: bytes) -> Phantom:
+    """Read bytes in a worker process and return the phantom."""
     worker = Worker(MEMORY_BYTES)
     try:
         [text] = worker.ask(document, (read, how), [raw], TIMEOUT_S)

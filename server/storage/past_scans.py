@@ -40,24 +40,27 @@ from flexdt.twin.errors import LimitError, TwinError
 from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.machine.description import Machine, Profile
 
-AT_ONCE: Final = 2
+WORKERS: Final = 2
+"""Number of worker processes."""
 MEMORY_BYTES: Final = 3 << 30
 SECONDS: Final = 30.0
 MAX_SETS: Final = 2000
-"""Folders that are listed, the newest first; older ones are counted."""
+"""Largest number of folders that are listed, the newest first; older ones are counted."""
 LIST_S: Final = 4.0
-"""Time after which a list says what it knows; the rest is read when it is asked for again."""
+"""Time limit for a list [s]; the rest is read at the next request."""
 MEASURE_S: Final = 10.0
-"""As `LIST_S`, for mean counts."""
-MAX_DOCUMENT: Final = 256 << 20
-LISTED_DOCUMENT: Final = 64 << 20
-"""Bytes of a flexdt.json that is read for a list."""
-MAX_SCRIPT: Final = 4 << 20
+"""Time limit for computing mean counts [s]."""
+MAX_DOCUMENT_BYTES: Final = 256 << 20
+"""Largest flexdt.json [bytes]."""
+MAX_LISTED_DOCUMENT_BYTES: Final = 64 << 20
+"""Largest flexdt.json that is read for a list [bytes]."""
+MAX_SCRIPT_BYTES: Final = 4 << 20
+"""Largest script [bytes]."""
 
 
 @dataclass(frozen=True)
 class TwinContext:
-    """What the twin knows and a data set does not say.
+    """Facts about the twin that a data set does not hold.
 
     Attributes:
         running: name of the data set that is being written; "" for none.
@@ -70,7 +73,7 @@ class TwinContext:
 
 
 class PastScans:
-    """Answers `dataset.*`, `calibration.fit` and `.align`; `close` it in the end.
+    """Answers `dataset.*`, `calibration.fit` and `.align`; the caller closes it.
 
     Args:
         root: the data directory.
@@ -81,11 +84,11 @@ class PastScans:
         self._root = root
         self._machine = machine.model_dump(mode="json", by_alias=True)
         self._profile = profile.model_dump(mode="json")
-        self._workers = Workers(AT_ONCE, MEMORY_BYTES, SECONDS)
-        self._fitters = Workers(1, dataset_fits.MEMORY_BYTES, dataset_fits.SECONDS)
+        self._workers = Workers(WORKERS, MEMORY_BYTES, SECONDS)
+        self._fitters = Workers(1, dataset_fits.MAX_MEMORY_BYTES, dataset_fits.MAX_SECONDS)
 
     async def ask(self, params: Params, running: str, codec: Codec) -> Encoded:
-        """The answer, encoded.
+        """Answer a request in a worker process.
 
         Args:
             params: of the method.
@@ -93,8 +96,11 @@ class PastScans:
             codec: of the answer.
 
         Raises:
-            RpcError: -32602, there is no such data set or image, or it is damaged; -32008, it is
-                larger, or takes longer to read, than is allowed.
+            RpcError: -32602, there is no such data set or image, or it is damaged;
+                -32008, it is larger, or takes longer to read, than is allowed.
+
+        Returns:
+            The encoded answer.
         """
         around = TwinContext(running, self._machine, self._profile)
         slow = isinstance(params, CalibrationFit | CalibrationAlign)
@@ -108,7 +114,7 @@ class PastScans:
 
 
 def work(root: Path, asked: Params, around: TwinContext, codec: Codec) -> list[bytes]:
-    """In the worker: the encoded answer."""
+    """Answer a request in the worker; return the encoded answer."""
     try:
         directory = Directory(root)
         with directory, files.confined(directory):
@@ -120,7 +126,7 @@ def work(root: Path, asked: Params, around: TwinContext, codec: Codec) -> list[b
 
 
 class _LruCache:
-    """Results by key, the last `most` of them."""
+    """Cache of the last `most` results by key."""
 
     def __init__(self, most: int) -> None:
         self._most, self._made = most, dict[Hashable, Any]()
@@ -129,7 +135,7 @@ class _LruCache:
         return key in self._made
 
     def get(self, key: Hashable, make: Callable[[], Any]) -> Any:
-        """What was made for `key`, or is made now."""
+        """Return the value of `key`, made now if it is not known."""
         value = self._made[key] = self._made.pop(key) if key in self._made else make()
         if len(self._made) > self._most:
             del self._made[next(iter(self._made))]
@@ -145,7 +151,7 @@ _INFOS, _THUMBNAILS = _LruCache(MAX_SETS), _LruCache(1000)
 
 @dataclass(frozen=True)
 class _UndocumentedFrame:
-    """An image of which its file is known, and perhaps what the scanner's texts say."""
+    """An image with a known file, and perhaps settings from the scanner's texts."""
 
     file: str
     kind: FrameKind
@@ -164,13 +170,14 @@ _Images = tuple[FrameEntry | _UndocumentedFrame, ...]
 
 @dataclass(frozen=True, eq=False)
 class _Scan:
-    """A data set's folder as it was read; the last few are kept, and what is made of them.
+    """A data set's folder as it was read; the last few are cached, with what is computed
+    from them.
 
     Attributes:
         folder: its files.
         images: of all kinds, in the order taken.
-        document: flexdt.json; None where there is none, or none of use.
-        texts: where there is none, the data set that the scanner's texts tell (a `DataSet`).
+        document: flexdt.json; None without one, or without one of use.
+        texts: without a document, the data set of the scanner's texts (a `DataSet`).
         problem: why there is no document.
         key: changes with the folder.
     """
@@ -190,7 +197,7 @@ class _Scan:
 
 
 def _place(root: Directory, name: str) -> tuple[Path, tuple[object, ...]]:
-    """A data set's folder, and a key that changes with its files and its document."""
+    """Find a data set's folder, and a key that changes with its files and its document."""
     about = root.stat(plain_name(name, "data set"))
     if about is None or not stat.S_ISDIR(about.st_mode):
         raise ds.DatasetMissingError(f"no data set {name!r} in the data directory", {"asked": name})
@@ -199,6 +206,7 @@ def _place(root: Directory, name: str) -> tuple[Path, tuple[object, ...]]:
 
 
 def _scan(folder: files.Folder, most: int) -> _Scan:
+    """Read a folder: its document of at most `most` bytes, else the scanner's texts."""
     try:
         if folder.document is None:
             raise ds.DatasetMissingError(
@@ -232,7 +240,7 @@ def _scan(folder: files.Folder, most: int) -> _Scan:
 
 
 def _texts(folder: files.Folder) -> Any:
-    """What the scanner's own texts say of a folder without a document; None for nothing."""
+    """Read the scanner's own texts of a folder without a document; None if there are none."""
     from flexdt.library.reading.folders import load_dataset  # heavy: only workers need it
 
     if folder.document:
@@ -244,16 +252,18 @@ def _texts(folder: files.Folder) -> Any:
 
 
 def _opened(root: Directory, name: str) -> _Scan:
-    """A data set."""
+    """Read a data set, or return the cached one."""
     return _kept_scan(*_place(root, name))
 
 
 @lru_cache(4)
 def _kept_scan(path: Path, key: tuple[object, ...]) -> _Scan:
-    return replace(_scan(files.list_folder(path), MAX_DOCUMENT), key=key)
+    """Read a folder; the last four are cached by their keys."""
+    return replace(_scan(files.list_folder(path), MAX_DOCUMENT_BYTES), key=key)
 
 
 def _info(path: Path, modified: float, scan: _Scan) -> p.DatasetInfo:
+    """Summarise a data set."""
     folder, document = scan.folder, scan.document
     kV, power_W = scan.beam
     if document is None:
@@ -302,6 +312,7 @@ def _info(path: Path, modified: float, scan: _Scan) -> p.DatasetInfo:
 def _list(
     root: Directory, asked: p.DatasetList, around: TwinContext, codec: Codec
 ) -> p.DatasetListResult:
+    """Answer dataset.list: the data sets that match the search, within the time limit."""
     folders, left_out = [], 0
     with root.entries() as entries:
         for entry in entries:
@@ -343,18 +354,18 @@ def _list(
 
 
 def _as_it_runs(info: p.DatasetInfo, around: TwinContext) -> p.DatasetInfo:
-    """With the state of a data set that is being written."""
+    """Set the state of a data set that is being written."""
     running = info.name == around.running
     return info.model_copy(update={"state": "running", "reason": ""}) if running else info
 
 
 def _listed(path: Path, modified: float) -> p.DatasetInfo | str:
-    """A data set in a few words; "" for a folder that holds none."""
+    """Summarise a data set; "" for a folder that holds none."""
     folder = files.list_folder(path)
     if folder.document is None and not folder.projections:
         return ""
     try:
-        scan = _scan(folder, LISTED_DOCUMENT)
+        scan = _scan(folder, MAX_LISTED_DOCUMENT_BYTES)
     except (TwinError, MemoryError) as error:
         problem = str(from_root(str(error), path.parent))
         scan = _Scan(folder, problem=problem or "it takes too much memory")
@@ -362,7 +373,10 @@ def _listed(path: Path, modified: float) -> p.DatasetInfo | str:
 
 
 def _with_thumbnail(root: Directory, info: p.DatasetInfo, side: int, until: float) -> p.DatasetInfo:
+    """Add a thumbnail to a summary, unless the time is over."""
+
     def make() -> ImageValue | str:
+        """Make the thumbnail of the middle projection; "" if there is none."""
         folder = files.list_folder(path)
         images = list(folder.projections.values())
         if not images:
@@ -394,6 +408,7 @@ def _with_thumbnail(root: Directory, info: p.DatasetInfo, side: int, until: floa
 def _get(
     root: Directory, asked: p.DatasetGet, around: TwinContext, codec: Codec
 ) -> p.DatasetResult:
+    """Answer dataset.get: settings, poses over time, and what else is requested."""
     scan = _opened(root, asked.name)
     folder, images = scan.folder, scan.images
     about = root.stat(asked.name)
@@ -420,6 +435,7 @@ def _get(
 
 
 def _same(scan: _Scan, around: TwinContext) -> bool:
+    """Return whether the twin has the machine and the profile of a data set."""
     said, texts = scan.document, scan.texts
     machine, profile = (said.machine, said.profile) if said else ({}, None)
     if texts is not None and texts.profile is not None and texts.positions:
@@ -431,16 +447,17 @@ def _same(scan: _Scan, around: TwinContext) -> bool:
 
 
 def _script(folder: files.Folder) -> str:
+    """Read the script of a data set."""
     if SCRIPT not in folder.names:
         raise ds.DatasetMissingError(f"{folder.path.name}: no script lies with this data set")
     with files.opened(folder.path / SCRIPT) as file:
-        if (size := os.fstat(file.fileno()).st_size) > MAX_SCRIPT:
-            raise too_large("the script of a data set", size, MAX_SCRIPT)
+        if (size := os.fstat(file.fileno()).st_size) > MAX_SCRIPT_BYTES:
+            raise too_large("the script of a data set", size, MAX_SCRIPT_BYTES)
         return file.read().decode("utf-8", "replace")
 
 
 def _measured(scan: _Scan, at: tuple[int, ...]) -> dict[str, Any]:
-    """Mean counts and clearances of images; means are kept, so what is late comes the next time."""
+    """Compute mean counts and clearances of images; late ones come with the next request."""
     until = time.monotonic() + MEASURE_S
     counts: list[float | None] = []
     for i in at:
@@ -460,11 +477,13 @@ def _measured(scan: _Scan, at: tuple[int, ...]) -> dict[str, Any]:
 
 @lru_cache(16 * 2000)
 def _mean(path: Path, key: tuple[object, ...]) -> float:
+    """Compute the mean count of an image; cached."""
     return float(files.read_image(path).mean())
 
 
 @lru_cache(4)
 def _clearances(scan: _Scan, at: tuple[int, ...]) -> tuple[list[float | None], str]:
+    """Compute the smallest clearance of images [mm], and describe what was in the scene."""
     from flexdt.twin.collision.collision_scene import build_scene
     from flexdt.twin.collision.convex_solids import UprightCylinder
     from flexdt.twin.collision.first_contact import clearance
@@ -491,6 +510,7 @@ def _clearances(scan: _Scan, at: tuple[int, ...]) -> tuple[list[float | None], s
 def _frame(
     root: Directory, asked: p.DatasetFrame, around: TwinContext, codec: Codec
 ) -> p.DatasetFrameResult:
+    """Answer dataset.frame: one image, normalised and binned as requested."""
     scan = _opened(root, asked.name)
     folder, document, images = scan.folder, scan.document, scan.images
     if asked.index >= len(images):
@@ -537,6 +557,7 @@ def _frame(
 
 
 def _there(folder: files.Folder, file: str) -> str:
+    """Check that a file exists, and return its name."""
     if file not in folder.names:
         raise ds.DatasetMissingError(f"{folder.path.name}: {file} is not there", {"path": file})
     return file
@@ -544,6 +565,7 @@ def _there(folder: files.Folder, file: str) -> str:
 
 @lru_cache(4)
 def _normal(scan: _Scan, shape: tuple[int, int]) -> LineIntegrals:
+    """Make the normalisation of a data set from its dark and flat images; cached."""
     folder = scan.folder
     dark, flat = (
         folder.paths([f.file for f in scan.images if f.kind == kind]) for kind in ("dark", "flat")

@@ -25,13 +25,13 @@ from flexdt.server.storage.disk_room import DiskRoom, require_last
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 from flexdt.twin.errors import LimitError
 
-MOST = 4
-"""Uploads under way at a time."""
+MAX_UPLOADS = 4
+"""Largest number of uploads under way."""
 MAX_UPLOAD_BYTES = 512 << 20
 
 
 class UploadHead(SampleUpload):
-    """What an upload is: every chunk repeats it, and it lies beside the bytes as a document.
+    """Description of an upload: every chunk repeats it, and it is stored beside the bytes.
 
     Attributes:
         unit: of mesh coordinates.
@@ -45,7 +45,7 @@ class UploadHead(SampleUpload):
 
     @classmethod
     def of(cls, chunk: SampleUpload) -> UploadHead:
-        """Of the upload to which a chunk belongs."""
+        """Make the description of the upload to which a chunk belongs."""
         given = chunk.model_dump(exclude={"start", "data"})
         return cls.model_validate(given | {"unit": chunk.unit or default_unit(chunk.format)})
 
@@ -72,10 +72,10 @@ class Incoming:
         self._lock = threading.Lock()
 
     def receive(self, head: UploadHead, start: int, data: bytes) -> int:
-        """Take a chunk; returns the bytes received so far.
+        """Write a chunk; return the bytes received so far.
 
-        A chunk that has come before is passed over, so a client may send it again; a chunk at 0
-        of another file under the same name begins anew.
+        A chunk that has come before is passed over, so a client may send it again; a
+        chunk at 0 of another file under the same name begins anew.
 
         Raises:
             LimitError: a gap before this chunk, or the upload was dropped for newer ones.
@@ -105,7 +105,7 @@ class Incoming:
             return known.received
 
     def take(self, name: str) -> tuple[UploadHead, bytes]:
-        """An upload of which all bytes have come; it is under way no more.
+        """Read a complete upload and remove it from those under way.
 
         Raises:
             LimitError: it is not whole, because another one was begun under its name.
@@ -122,10 +122,11 @@ class Incoming:
                 self._close(name)
 
     def _begin(self, head: UploadHead) -> _Open:
+        """Begin an upload, in place of its namesake and of the oldest beyond `MAX_UPLOADS`."""
         self._close(head.name)
         if self._disk is not None:  # while it comes, and then under its name
             self._disk.require(f"the upload {head.name!r}", 2 * head.total)
-        while len(self._open) >= MOST:
+        while len(self._open) >= MAX_UPLOADS:
             self._drop()
         self._folder.make()
         with self._writing():
@@ -134,30 +135,35 @@ class Incoming:
         return made
 
     def _make_room(self, name: str, more: int) -> None:
+        """Drop the oldest other uploads until `more` bytes fit."""
         while sum(o.received for o in self._open.values()) + more > self._limit:
             if all(other == name for other in self._open):
                 break  # the largest upload alone always fits
             self._drop(but=name)
 
     def _drop(self, but: str | None = None) -> None:
+        """Drop the oldest upload but one, and log it."""
         oldest = next(name for name in self._open if name != but)
         log("an unfinished upload was dropped for newer ones", logging.WARNING, name=oldest,
             received=self._open[oldest].received)  # fmt: skip
         self._close(oldest)
 
     def _close(self, name: str) -> None:
+        """Close the file of an upload, which deletes it."""
         known = self._open.pop(name, None)
         if known is not None:
             known.file.close()
 
     def _gap(self, name: str, start: int, received: int) -> LimitError:
+        """Make the error for a chunk that does not follow the last one."""
         return LimitError(
             f"upload {name!r}: the chunk begins at {start}, but {received} bytes have come; "
-            f"chunks come in order, from 0, and {MOST} uploads and {self._limit} bytes are kept at "
-            "a time: one begun before may have been dropped for newer ones",
+            f"chunks come in order, from 0, and {MAX_UPLOADS} uploads and {self._limit} bytes are "
+            "kept at a time: one begun before may have been dropped for newer ones",
             {"asked": start, "allowed": received},
         )
 
     def _writing(self) -> AbstractContextManager[None]:
+        """Convert the system's errors inside."""
         path = self._folder.path
         return writing(path, f"the upload cannot be kept in {path}")

@@ -19,7 +19,7 @@ from flexdt.twin.scanner.state import NamedCorrection, Sample, StagePlacement
 def save_scene(
     scanner: ScannerTwin, now: float, *, name: str = "", saved: str = "", version: str = ""
 ) -> p.Scene:
-    """The scanner as a document; a motor under way is saved where it is bound."""
+    """Convert the scanner to a document; a motor under way is saved at its target."""
     return p.Scene(
         schema=1,
         flexdt=version,
@@ -44,7 +44,7 @@ def save_scene(
 
 
 def correction_fields(correction: NamedCorrection) -> dict[str, Any]:
-    """A correction as documents and the wire name its values, in mm and deg."""
+    """Convert a correction to the names and units of documents and the wire (mm, deg)."""
     return {
         "name": correction.name,
         "date": correction.date,
@@ -54,7 +54,7 @@ def correction_fields(correction: NamedCorrection) -> dict[str, Any]:
 
 
 def correction_of(part: p.CorrectionPart) -> NamedCorrection:
-    """The correction of a document.
+    """Make the correction of a document.
 
     Raises:
         UnknownNameError: a name that is not a parameter.
@@ -84,7 +84,8 @@ def require_fit(scene: p.Scene, scanner: ScannerTwin) -> None:
 
 
 def paces_of(scene: p.Scene, scanner: ScannerTwin) -> dict[str, tuple[float, float]]:
-    """Motor -> (speed, acceleration) with the scene's where it has them."""
+    """Return motor -> (speed, acceleration): the scene's where it has them, else the
+    scanner's."""
     return {
         axis: (scene.speeds.get(axis, speed), scene.accelerations.get(axis, acceleration))
         for axis, (speed, acceleration) in scanner.paces.items()
@@ -103,7 +104,7 @@ def apply_settings(scene: p.Scene, scanner: ScannerTwin) -> None:
 
 
 def sample_of(scene: p.Scene) -> Sample:
-    """The scene's sample."""
+    """Return the scene's sample."""
     return Sample(
         scene.sample.name, StagePlacement(**scene.sample.offset.model_dump()), scene.sample.material
     )

@@ -30,22 +30,23 @@ from flexdt.server.storage.sample_uploads import MAX_UPLOAD_BYTES, Incoming, Upl
 from flexdt.twin.errors import LimitError, UnknownNameError
 
 KEPT = 8
-"""Parsed samples kept; meshes may be large."""
+"""Number of parsed samples that are cached; meshes may be large."""
 DEFAULT_MATERIAL = "abs"
 EMPTY = "empty"
-"""The name that clears the stage."""
+"""Name that clears the stage."""
 
 
 @dataclass(frozen=True)
 class ReceivedSample:
-    """An upload that is whole and readable.
+    """A complete, readable upload.
 
     Attributes:
-        head: what it is.
+        head: its description.
         raw: its bytes.
-        phantom: what they are, of the material it was uploaded with.
+        phantom: parsed, of the material it was uploaded with.
         revision: names its content.
-        worn: the same of another material, in which it is to stand on the stage.
+        worn: material and phantom of another material, in which it is to stand on the
+            stage.
     """
 
     head: UploadHead
@@ -56,12 +57,12 @@ class ReceivedSample:
 
     @property
     def shown(self) -> str:
-        """A name of what it shows, as `SampleStore.revision` gives it."""
+        """Identifier of what it shows, as `SampleStore.revision` returns it."""
         return _shown(self.head, self.revision)
 
     @property
     def standing(self) -> Phantom:
-        """The phantom that it will be on the stage."""
+        """The phantom as it will be on the stage."""
         return self.phantom if self.worn is None else self.worn[1]
 
 
@@ -114,21 +115,22 @@ class SampleStore:
 
     @property
     def uploads(self) -> tuple[str, ...]:
-        """Names of the uploads that are whole."""
+        """Names of the complete uploads."""
         return tuple(self._heads)
 
     def head(self, name: str) -> UploadHead | None:
-        """What was uploaded under `name`, or None for a shipped phantom."""
+        """Return the description of the upload called `name`, or None for a shipped phantom."""
         return self._heads.get(name)
 
     def revision(self, name: str) -> str | None:
-        """Names what an upload that has been read shows; None for a shipped phantom."""
+        """Return an identifier of what an upload that has been read shows; None for a
+        shipped phantom."""
         with self._lock:
             revision, head = self._revisions.get(name), self._heads.get(name)
         return None if revision is None or head is None else _shown(head, revision)
 
     def load(self, name: str, material: str | None = None) -> Phantom:
-        """The phantom called `name`; parsed once and cached.
+        """Load the phantom called `name`; parsed once and cached.
 
         Args:
             name: a shipped phantom's or an upload's.
@@ -152,6 +154,7 @@ class SampleStore:
         return phantom
 
     def _keep(self, key: tuple[str, str | None], phantom: Phantom, revision: str | None) -> None:
+        """Cache a phantom; drop the oldest ones beyond the limits, except that on the stage."""
         self._loaded[key] = phantom
         if revision is not None:
             self._revisions[key[0]] = revision
@@ -162,7 +165,7 @@ class SampleStore:
             del self._loaded[old]
 
     def receive(self, head: UploadHead, start: int, data: bytes) -> int:
-        """Take a chunk, see `Incoming.receive`; returns the bytes received so far.
+        """Receive a chunk, see `Incoming.receive`; return the bytes received so far.
 
         Raises:
             RpcError: -32008, larger than allowed.
@@ -224,7 +227,7 @@ class SampleStore:
                 self._keep((name, upload.worn[0]), upload.worn[1], upload.revision)
 
     def remove(self, changes: own.Changes, name: str) -> None:
-        """Delete what says that there is an upload; `tidy` removes its bytes after `forget`.
+        """Delete the description of an upload; `tidy` removes its bytes after `forget`.
 
         Raises:
             DatasetWriteError: the system refuses.
@@ -232,12 +235,12 @@ class SampleStore:
         changes.remove(self._folder, f"{own.file_stem(name)}.json")
 
     def forget(self, name: str) -> None:
-        """Know an upload no longer."""
+        """Remove an upload from memory."""
         with self._lock:
             self._replace(name, None)
 
     def _replace(self, name: str, new: UploadHead | None) -> None:
-        """Know another upload under a name, or none; with the lock held."""
+        """Register another upload under a name, or none; with the lock held."""
         old = self._heads.pop(name, None)
         if old is not None:
             self._replaced.add(_bytes_file(name, old.revision))
@@ -257,7 +260,8 @@ class SampleStore:
                 self._folder.unlink(file)
 
     def _settle(self) -> None:
-        """At the start: delete bytes that no upload has, and what killed writers left behind."""
+        """Clean the folder at the start: delete bytes without an upload, and what killed
+        writers left."""
         self._folder.sweep([TEMPORARY])
         known = {_bytes_file(name, head.revision) for name, head in self._heads.items()}
         there = self._folder.names()
@@ -287,7 +291,7 @@ class SampleStore:
         return phantom, _revision(head, raw)
 
     def _bytes(self, head: UploadHead) -> bytes:
-        """The bytes of an upload; a damaged one is set aside and raises."""
+        """Read the bytes of an upload; a damaged one is set aside and raises."""
         stored = head.revision
         file = _bytes_file(head.name, stored)
         try:
@@ -309,23 +313,25 @@ class SampleStore:
 
 
 def _bytes_of(phantom: Phantom) -> int:
-    """Memory that the arrays of a phantom take."""
+    """Return the memory that the arrays of a phantom take [bytes]."""
     voxels = 0 if phantom.voxels is None else phantom.voxels.data.nbytes
     return voxels + sum(s.vertices.nbytes + s.faces.nbytes for s in phantom.surfaces)
 
 
 def _revision(head: UploadHead, raw: bytes) -> str:
-    """A name of a content: bytes and how they are read."""
+    """Hash a content: bytes and how they are read."""
     how = f"{head.kind} {head.format} {head.unit} {head.shape} {head.voxel_mm}".encode()
     return hashlib.sha256(how + b"\0" + raw).hexdigest()[:16]
 
 
 def _shown(head: UploadHead, revision: str) -> str:
-    """A name of what an upload shows: the same content may come again in another material."""
+    """Return an identifier of what an upload shows: the same content may come in another
+    material."""
     return revision if head.material is None else f"{revision} {head.material}"
 
 
 def _parse(head: UploadHead, raw: bytes, material: str | None) -> Phantom:
+    """Parse the bytes of an upload: mesh or scene in a worker, voxels here."""
     if head.kind == "mesh":
         return mesh_apart(
             raw,
@@ -355,7 +361,7 @@ def _parse(head: UploadHead, raw: bytes, material: str | None) -> Phantom:
 
 
 def _bytes_file(name: str, revision: str | None) -> str:
-    """The file of an upload's bytes; earlier servers kept one file for each name."""
+    """Return the file name of an upload's bytes; earlier servers had one file for each name."""
     return (
         f"{own.file_stem(name)}.bin"
         if revision is None
@@ -364,9 +370,11 @@ def _bytes_file(name: str, revision: str | None) -> str:
 
 
 def _head_of(file: str) -> Callable[[bytes], UploadHead]:
-    """Reads what lies beside an upload, as if it was uploaded now."""
+    """Make the reader of an upload's description, which validates it as if it was
+    uploaded now."""
 
     def read(data: bytes) -> UploadHead:
+        """Parse a description and check its name."""
         head = UploadHead.model_validate(own.read_json(data))
         if file != f"{own.file_stem(head.name)}.json":
             raise ValueError(f"it is about {head.name!r}")
@@ -376,7 +384,7 @@ def _head_of(file: str) -> Callable[[bytes], UploadHead]:
 
 
 def sample_material(head: UploadHead | None, material: str | None) -> str | None:
-    """Material that a mesh is filled with; None for a sample that has its own."""
+    """Return the material that a mesh is filled with; None for a sample that has its own."""
     if head is None or head.kind != "mesh":
         return None
     chosen = head.material if material is None else material

@@ -13,7 +13,7 @@ from in_process import Lab, run
 from flexdt.protocol import METHODS, RpcError, parse_params
 from flexdt.protocol.field_checks import MAX_STEM
 from flexdt.runtime.files.directory import open_data
-from flexdt.server.storage.sample_uploads import MOST, Incoming, UploadHead
+from flexdt.server.storage.sample_uploads import MAX_UPLOADS, Incoming, UploadHead
 from flexdt.twin.errors import LimitError
 
 SCRIPT = "camera\tset exposure\t100\t\tACK\t\t"
@@ -158,7 +158,7 @@ def head(name: str, total: int) -> UploadHead:
 
 def test_unfinished_uploads_are_bounded_and_their_senders_are_told(tmp_path: Path) -> None:
     incoming: Incoming = Incoming(open_data(tmp_path), limit=1000)
-    for i in range(MOST + 1):
+    for i in range(MAX_UPLOADS + 1):
         assert incoming.receive(head(f"n{i}", 900), 0, b"x" * 10) == 10
     with pytest.raises(LimitError, match=r"4 uploads and 1000 bytes are kept"):
         incoming.receive(head("n0", 900), 10, b"y")

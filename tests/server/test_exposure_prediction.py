@@ -15,7 +15,7 @@ import flexdt as fx
 from flexdt.phantoms.samples import as_phantom
 from flexdt.protocol import METHODS, Codec, RpcError
 from flexdt.protocol.methods.image_messages import ExposurePrediction
-from flexdt.server.imaging.radiography import BEST, predict
+from flexdt.server.imaging.radiography import MAX_PROPOSALS, predict
 from flexdt.twin.errors import LimitError
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.scanner.state import changed_camera
@@ -47,7 +47,7 @@ def test_a_prediction_is_what_noisy_images_show() -> None:
     assert (told.saturated, told.starved) == (0.0, 0.0)
     assert told.frames == 100
     assert told.seconds == pytest.approx(15.0)
-    assert len(told.best) == BEST
+    assert len(told.best) == MAX_PROPOSALS
     cnr = [one.cnr for one in told.best]
     assert cnr == sorted(cnr, reverse=True)
 

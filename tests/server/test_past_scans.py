@@ -367,7 +367,7 @@ def test_a_huge_document_is_listed_unread_and_refused(
 ) -> None:
     shutil.copytree(data / "first scan", tmp_path / "big")
     with (tmp_path / "big" / "flexdt.json").open("ab") as file:
-        file.truncate(past_scans.MAX_DOCUMENT + 1)
+        file.truncate(past_scans.MAX_DOCUMENT_BYTES + 1)
     [info] = listed(tmp_path)
     assert info["state"] == "unknown"
     assert "allowed: " in info["problem"]
@@ -376,7 +376,7 @@ def test_a_huge_document_is_listed_unread_and_refused(
     assert not told["same_machine"]
     assert told["positions"] == {}
     assert told["images"] == FRAMES + 2
-    monkeypatch.setattr(past_scans, "MAX_SCRIPT", 10)
+    monkeypatch.setattr(past_scans, "MAX_SCRIPT_BYTES", 10)
     with pytest.raises(RpcError) as refused:
         asked(tmp_path, DatasetGet(name="big", script=True))
     assert refused.value.code == -32008

@@ -72,7 +72,7 @@ def test_paths_through_a_box_are_those_of_the_solid() -> None:
 
 
 def test_drawn_meshes_come_whole_in_many_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("flexdt.server.imaging.projector_client.CHUNK", 1000)
+    monkeypatch.setattr("flexdt.server.imaging.projector_client.CHUNK_BYTES", 1000)
 
     async def body(server: ProjectorServer, client: ProjectorUser) -> None:
         rng = np.random.default_rng(11)
