@@ -6,6 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 COMPILED := $(VENV)/.compiled
 TEST_STAMP := $(VENV)/.installed-test
+DOCS_STAMP := $(VENV)/.installed-docs
 COLLECTED := build/.collected
 LINTED := build/.linted
 TYPED := build/.typed
@@ -41,6 +42,12 @@ $(COMPILED): $(STAMP)
 $(TEST_STAMP): $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test]' \
 	  -e 'extensions[test]'
+	touch $@
+
+# What the site is built with: Sphinx, and the extras whose modules and notebooks are on its pages.
+$(DOCS_STAMP): $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]' \
+	  -e 'extensions[docs]'
 	touch $@
 
 # TypeScript and eslint for the page. Without npm's registry the tests that need them are skipped.
@@ -123,7 +130,7 @@ web: install $(WEB_STAMP)
 	$(BIN)/python tests/viewer/test_page_source.py
 
 # The site, notebooks executed; warnings are errors. Result: docs/_build/html/index.html
-docs: $(TEST_STAMP)
+docs: $(DOCS_STAMP)
 	$(BIN)/python -m sphinx -b html -n -W --keep-going -q docs docs/_build/html
 
 # Lines by room, import circles, copied lists, prose and the like, beside the last release. For looking:

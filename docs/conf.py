@@ -30,10 +30,12 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
     "generated_pages",
+    "made_figures",
     "plain_docstrings",
     "links_outside",
+    "redirects",
 ]
-exclude_patterns = ["_build", "_ext", "_static", "tools", "**/.ipynb_checkpoints"]
+exclude_patterns = ["_build", "_ext", "_static", "history", "tools", "**/.ipynb_checkpoints"]
 source_suffix = {".md": "myst-nb", ".rst": "restructuredtext"}
 master_doc = "index"
 nitpicky = True

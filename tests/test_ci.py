@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 import yaml
+from doc_pages import pages
 
 ROOT = Path(__file__).resolve().parents[1]
 WORKFLOWS = ROOT / ".github" / "workflows"
@@ -91,8 +92,8 @@ DATE = re.compile(r"\b20\d\d-\d\d-\d\d\b")
 def others_commands() -> list[tuple[str, str, str]]:
     """Each such command of the documentation: page, command, and the row or paragraph around it."""
     found = []
-    for page in sorted((ROOT / "docs").rglob("*.md")):
-        text = re.sub(r"^```.*?^```", "", page.read_text("utf-8"), flags=re.MULTILINE | re.DOTALL)
+    for page, whole in pages().items():
+        text = re.sub(r"^```.*?^```", "", whole, flags=re.MULTILINE | re.DOTALL)
         for block in re.split(r"\n\n|\n(?=\|)", text):
             for command in NEEDS.findall(block):
                 found.append((page.relative_to(ROOT).as_posix(), command.strip("`"), block))

@@ -1,14 +1,33 @@
-"""Reference pages made at build time: the wire from OpenRPC, the command line from its own tree.
+"""Write the pages that follow from code and data: wire, commands, Python modules, evidence.
 
-They are written to `_generated/` beside the pages, only when they change. It refuses to describe
-anything that the code does not say.
+They are written to `_generated/` beside the pages, only when they change.
 """
 
 from __future__ import annotations
 
+import importlib
+import json
+import re
+import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
+
+import evidence_pages
+
+MODULE = re.compile(r"^### `(flexdt[\w.]*)`$", re.MULTILINE)
+"""Heading of a public module on a page that lists them."""
+
+MODULE_LISTS = {"reference/python": "python", "extensions/reference": "python-extensions"}
+"""Page that lists public modules -> folder of their pages in `_generated/`."""
+
+MODULE_OPTIONS = {
+    "flexdt.twin.reconstruction": "   :exclude-members: Grid\n",
+    "flexdt.library.datasets.exchange": "   :exclude-members: ExchangeError, ScanGeometry\n",
+    "flexdt.twin.physics": "   :exclude-members: Detector\n\n"
+    ".. autoclass:: flexdt.twin.physics.Detector\n   :no-members:\n",
+}
+"""Options of autodoc for a module, where a name is documented elsewhere."""
 
 
 def wire() -> str:
@@ -167,19 +186,92 @@ def _code(text: str) -> str:
     return "`" + text.replace("|", "\\|") + "`"
 
 
-PAGES = {"wire.md": wire, "commands.md": commands}
+def benchmark() -> str:
+    """Return the kept benchmark's tables and figure as Markdown."""
+    tools = Path(__file__).resolve().parent.parent / "tools"
+    if str(tools) not in sys.path:
+        sys.path.append(str(tools))
+    import bench_page
+
+    document = json.loads((tools.parent / "images" / "bench.json").read_text("utf-8"))
+    return "\n".join([
+        "# Projector beside peers",
+        "",
+        "Commands: `flexdt bench --out out/bench`, `python examples/research/further_bench.py "
+        "--out out/further`. Ratios are taken turn by turn in the same run; errors are of the "
+        "maximum; cases are those of [the projector's page](../../performance.md#measure). LEAP is "
+        "not on PyPI and was not run: its rows are derived from its times and itk-rtk's, measured "
+        "together once on two Zen 4 cores of about 2.9 GHz.",
+        "",
+        bench_page.tables(document),
+        "",
+        "![ratios and growth](../../images/bench.svg)",
+        "",
+    ])  # fmt: skip
+
+
+PAGES = {"wire.md": wire, "commands.md": commands, "evidence/bench.md": benchmark}
+
+
+def module_pages(pages: Path) -> dict[str, str]:
+    """Return a page for each public module.
+
+    Args:
+        pages: the folder of all pages, with the pages that list the modules.
+
+    Returns:
+        Path below `_generated/` -> Markdown.
+    """
+    found = {}
+    for page, folder in MODULE_LISTS.items():
+        for name in MODULE.findall((pages / f"{page}.md").read_text("utf-8")):
+            options = MODULE_OPTIONS.get(name, "")
+            text = f"# `{name}`\n\n```{{eval-rst}}\n.. automodule:: {name}\n{options}```\n"
+            found[f"{folder}/{name}.md"] = text
+    return found
+
+
+def with_summaries(text: str, folder: str) -> str:
+    """Put each listed module's first sentence and the link to its page below its heading.
+
+    Args:
+        text: a page that lists modules.
+        folder: folder of their pages in `_generated/`.
+    """
+
+    def below(match: re.Match[str]) -> str:
+        name = match[1]
+        paragraph = (importlib.import_module(name).__doc__ or "").split("\n\n")[0]
+        return f"### [`{name}`](../_generated/{folder}/{name}.md)\n\n{_cell(paragraph)}"
+
+    return MODULE.sub(below, text)
+
+
+def summaries(app: Any, docname: str, content: list[str]) -> None:
+    """Complete the pages that list modules (Sphinx's hook `source-read`)."""
+    if docname in MODULE_LISTS:
+        content[0] = with_summaries(content[0], MODULE_LISTS[docname])
 
 
 def write(app: Any) -> None:
-    """Sphinx's hook, before pages are read."""
-    folder = Path(app.srcdir) / "_generated"
-    folder.mkdir(exist_ok=True)
-    for name, make in PAGES.items():
-        path, text = folder / name, make()
+    """Write what has changed and delete what no longer follows (hook `builder-inited`)."""
+    pages = Path(app.srcdir)
+    generated = pages / "_generated"
+    texts = {name: make() for name, make in PAGES.items()}
+    texts |= module_pages(pages)
+    for name, text in evidence_pages.pages(pages / "evidence").items():
+        texts[f"evidence/{name}"] = evidence_pages.moved(text)
+    for path in generated.rglob("*.md"):
+        if path.relative_to(generated).as_posix() not in texts:
+            path.unlink()
+    for name, text in texts.items():
+        path = generated / name
+        path.parent.mkdir(parents=True, exist_ok=True)
         if not path.exists() or path.read_text(encoding="utf-8") != text:
             path.write_text(text, encoding="utf-8")
 
 
 def setup(app: Any) -> dict[str, bool]:
     app.connect("builder-inited", write)
+    app.connect("source-read", summaries, priority=900)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

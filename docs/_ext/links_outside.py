@@ -1,17 +1,25 @@
 """Links from pages to files of the repository that are no pages.
 
 On a forge they open the file; on the site they become its path, since the site has no copy of it.
-A link to something that does not exist is a warning, so the build fails. It refuses to guess
-addresses.
+A link to a document of `docs/evidence/` leads to the page that is rendered from it. A link to
+something that does not exist is a warning, so the build fails.
 """
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 from typing import Any
 
 from sphinx.util import logging
+
+EVIDENCE = Path("evidence")
+"""Folder of the evidence documents, below the folder of all pages."""
+RENDERED = Path("_generated", "evidence")
+"""Folder of the pages that are rendered from them (`evidence_pages.py`)."""
+BENCHMARK = Path("images", "bench.json")
+"""The kept benchmark, which is rendered beside them."""
 
 log = logging.getLogger(__name__)
 LINK = re.compile(r"(?<!!)\[([^\]\n]+)\]\((?!https?:|mailto:|#)([^)\s#]+)(#[^)\s]*)?\)")
@@ -33,6 +41,12 @@ def rewritten(text: str, page: Path, pages: Path) -> tuple[str, list[str]]:
         if not found.exists():
             lost.append(target)
             return match[0]
+        if found.suffix == ".json" and (
+            found.parent == pages / EVIDENCE or found == pages / BENCHMARK
+        ):
+            rendered = pages / RENDERED / f"{found.stem}.md"
+            link = Path(os.path.relpath(rendered, page.parent)).as_posix()
+            return f"[{words}]({link}{match[3] or ''})"
         inside = found.is_relative_to(pages) and found.suffix == ".md"
         if inside or not found.is_relative_to(pages.parent):
             return match[0]

@@ -1,11 +1,11 @@
-"""The figures of docs/performance.md, from the document that `flexdt bench --out DIR` or
-`examples/research/further_bench.py` writes.
+"""The kept benchmark, from the document that `flexdt bench --out DIR` or
+`examples/research/further_bench.py` writes; the site renders it as a page of the evidence shelf.
 
     flexdt bench --out out/bench
-    python docs/tools/bench_page.py out/bench/bench.json [--page docs/performance.md]
+    python docs/tools/bench_page.py out/bench/bench.json
 
-What the benchmark did not run this time stays on the page as it was: the page's own document lies
-beside its picture, in images/bench.json. `--out DIR` writes bench.md and bench.svg instead.
+What the benchmark did not run this time stays as it was, in docs/images/bench.json. `--page FILE`
+also puts the figures between a page's marks; `--out DIR` writes bench.md and bench.svg instead.
 
 Targets are ratios to itk-rtk's Joseph projector and FDK in the same run, shares of the maximum,
 milliseconds, or ratios of the adjoint to the forward. LEAP cannot be installed from PyPI, so its
@@ -360,27 +360,34 @@ def _lines(points: Sequence[dict[str, Any]], label: str) -> str:
     return "".join(parts)
 
 
-def renew(page: Path, document: Document) -> None:
-    """Put the figures of `document` onto `page`, and its picture and document beside it."""
-    picture = page.parent / "images" / "bench.svg"
+def renew(folder: Path, document: Document, page: Path | None = None) -> None:
+    """Merge a document into the kept one, and draw it.
+
+    Args:
+        folder: of the pages; the kept document and its picture are in `images/` there.
+        document: of a new run.
+        page: gets the figures between its marks, too.
+    """
+    picture = folder / "images" / "bench.svg"
     picture.parent.mkdir(exist_ok=True)
     kept = picture.with_suffix(".json")
     if kept.exists():
         document = merged(json.loads(kept.read_text("utf-8")), document)
     kept.write_text(json.dumps(document, indent=1) + "\n", "utf-8")
     picture.write_text(figure(document), "utf-8")
-    page.write_text(into_page(page.read_text("utf-8"), document, "images/bench.svg"), "utf-8")
+    if page is not None:
+        page.write_text(into_page(page.read_text("utf-8"), document, "images/bench.svg"), "utf-8")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Tables and figure of a benchmark.")
     parser.add_argument("document", type=Path, help="bench.json")
-    parser.add_argument("--page", type=Path, default=Path("docs/performance.md"))
+    parser.add_argument("--page", type=Path, help="put the figures between this page's marks, too")
     parser.add_argument("--out", type=Path, help="write bench.md and bench.svg here instead")
     options = parser.parse_args()
     document = json.loads(options.document.read_text("utf-8"))
     if options.out is None:
-        renew(options.page, document)
+        renew(options.page.parent if options.page else Path("docs"), document, options.page)
     else:
         options.out.mkdir(parents=True, exist_ok=True)
         (options.out / "bench.svg").write_text(figure(document), "utf-8")

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from doc_pages import pages
 from typer.main import get_command
 
 from flexdt.clients.cli.command_tree import GROUPS, SECTIONS, build
@@ -94,9 +95,11 @@ def taken(path: str, command: Any) -> set[str]:
 def test_options_that_the_pages_name_are_taken() -> None:
     by_name = {path.removeprefix("flexdt "): taken(path, command) for path, command in parts()}
     found = []
-    history = set((ROOT / "docs" / "history").glob("*.md"))  # names what there was at the time
-    for page in {ROOT / "README.md", *(ROOT / "docs").rglob("*.md")} - history:
-        text = page.read_text("utf-8").replace("\\\n", " ")
+    texts = pages() | {ROOT / "README.md": (ROOT / "README.md").read_text("utf-8")}
+    for page, whole in texts.items():
+        if page.parent.name == "history":  # names what there was at the time
+            continue
+        text = whole.replace("\\\n", " ")
         for line in re.findall(r"(?:^|`)flexdt ([^`\n]*)", text, re.MULTILINE):
             words = line.split()
             name = " ".join(words[:2]) if " ".join(words[:2]) in by_name else words[0]

@@ -89,7 +89,7 @@ def test_annotations_by_hand_are_fitted_by_one_command(
 
 
 def test_the_example_of_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    page = (Path(__file__).parents[2] / "docs" / "calibration.md").read_text("utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "calibrate-any-scanner.md").read_text("utf-8")
     block = page.split("```python\n")[1].split("```")[0]
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}

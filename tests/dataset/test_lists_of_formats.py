@@ -119,7 +119,7 @@ def reconstruction_docstring() -> object:
 
 
 def scan_page() -> object:
-    table = page("data-sets.md", "| scan | needs | not said by the file |\n")
+    table = page("other-scanners.md", "| scan | needs | not said by the file |\n")
     rows = re.findall(r"^\| (\w+) ([^|]*) \|", table, re.MULTILINE)
     stated = {(name, ending) for name, cell in rows for ending in endings(cell)}
     return difference(stated, {(f.name, e) for f in foreign_files.SCAN_FORMATS for e in f.endings})

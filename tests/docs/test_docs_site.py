@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 import sys
@@ -51,4 +52,16 @@ def test_site_builds_without_a_warning(tmp_path: Path) -> None:
     assert abs(float(found[1]) + 1.1) < 5 * float(found[2])
     assert "state.get" in (html / "_generated" / "wire.html").read_text()
     assert 'id="flexdt-phantom-design"' in (html / "_generated" / "commands.html").read_text()
-    assert "project_points" in (html / "reference" / "python.html").read_text()
+    cone_vec = html / "_generated" / "python" / "flexdt.twin.geometry.cone_vec.html"
+    assert "project_points" in cone_vec.read_text()
+    assert "flexdt.twin.geometry.cone_vec.html" in (html / "reference" / "python.html").read_text()
+    # Evidence is rendered, old addresses forward, and the figures are made anew.
+    coverage = (html / "_generated" / "evidence" / "calibration.html").read_text()
+    assert 'id="coverage-of-the-joint-95-ellipsoid"' in coverage
+    assert "itk-rtk" in (html / "_generated" / "evidence" / "bench.html").read_text()
+    assert 'url=use.html"' in (html / "how-to.html").read_text()
+    made = json.loads((DOCS / "_generated" / "figures" / "figures.json").read_text())
+    kept = json.loads((DOCS / "images" / "made" / "figures.json").read_text())
+    assert [*made] == [*kept]
+    for name, numbers in kept.items():
+        assert made[name] == pytest.approx(numbers, rel=0.05, abs=1e-3), name

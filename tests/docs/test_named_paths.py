@@ -7,6 +7,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from doc_pages import evidence
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = (
@@ -19,6 +20,7 @@ PROSE = sorted(
     - {ROOT / "CHANGELOG.md", *(ROOT / "docs").glob("_*/**/*.md")}
     - {*(ROOT / "docs" / "history").glob("*.md")}
 )
+EVIDENCE = evidence()
 # Not files of the repository: a secret that its reader makes, and what `make docs` makes.
 ELSEWHERE = re.compile(r"docker/token\b|docs/_build\b")
 PATH = re.compile(rf"(?<![\w./-])((?:{'|'.join(map(re.escape, FOLDERS))})/[\w./*<>-]*[\w/*>])")
@@ -52,9 +54,9 @@ def is_module(path: str) -> bool:
     return False
 
 
-@pytest.mark.parametrize("page", PROSE, ids=lambda p: p.stem)
+@pytest.mark.parametrize("page", [*PROSE, *EVIDENCE], ids=lambda p: p.name.removesuffix(".md"))
 def test_named_paths_and_modules_exist(page: Path) -> None:
-    text = page.read_text()
+    text = EVIDENCE[page] if page in EVIDENCE else page.read_text()
     places = ROOT, page.parent
     paths = {p for p in named_paths(text) if not any(list(o.glob(p.rstrip("/"))) for o in places)}
     assert paths == set(), f"{page.relative_to(ROOT)} names what is not in the repository"

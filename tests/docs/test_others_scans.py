@@ -24,7 +24,7 @@ import flexdt as fx
 from flexdt.twin.geometry.conventions import FloatArray
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGE = (ROOT / "docs" / "data-sets.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "other-scanners.md").read_text(encoding="utf-8")
 BLOCKS = dict(re.findall(r"^### ([^\n]+)\n(?:(?!^### ).)*?```python\n(.*?)```", PAGE, re.M | re.S))
 START = 0.4
 """Stage angle of the first view [rad]."""

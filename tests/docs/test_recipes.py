@@ -20,7 +20,7 @@ FOLDERS = (
     "examples", "extensions",
 )  # fmt: skip
 PAGES = ("docs/phantoms.md", "docs/exchange.md", "docs/command-line.md", "docs/reconstruction.md",
-         "docs/data-sets.md", "docs/tutorials/own-sample.md")  # fmt: skip
+         "docs/other-scanners.md", "docs/tutorials/own-sample.md")  # fmt: skip
 ROW = re.compile(r"^\| (?!file \|)(?P<file>[^|]*)\| (?P<change>[^|]*)\| (?P<test>[^|]*)\|$", re.M)
 
 

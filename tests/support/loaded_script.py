@@ -9,6 +9,9 @@ from types import ModuleType
 
 
 def load(path: Path) -> ModuleType:
+    """Load a script, which may import the modules beside it."""
+    if str(path.parent) not in sys.path:
+        sys.path.append(str(path.parent))
     spec = importlib.util.spec_from_file_location(f"docs_{path.stem}", path)
     assert spec is not None
     assert spec.loader is not None
