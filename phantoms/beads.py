@@ -147,20 +147,26 @@ def bead_phantom(
         if name_or_dims not in CUBOIDS_MM:
             what = f"unknown bead cuboid {name_or_dims!r}; Table 6.2 has"
             raise UnknownNameError.among(what, name_or_dims, CUBOIDS_MM)
-        name, size = f"{name_or_dims}-{beads}", CUBOIDS_MM[name_or_dims]
+        name = f"{name_or_dims}-{beads}"
+        size = CUBOIDS_MM[name_or_dims]
     else:
         numbers = np.asarray(name_or_dims, dtype=np.float64)
         if numbers.shape[-1:] != (3,) or numbers.ndim > 2 or not numbers.size:
-            what, more = "a cuboid or beads", ", or (k, 3) [mm]"
+            what = "a cuboid or beads"
+            more = ", or (k, 3) [mm]"
             raise LimitError.of_shape(what, numbers.shape, (3,), more)
         if numbers.ndim == 2:
             many = len(numbers)
             x, y, z = (2.0 * (np.abs(numbers).max(axis=0) + bead_radius_mm)).tolist()
             return cuboid_with_beads(
-                f"beads-{many}", (x, y, z), numbers, np.full(many, bead_radius_mm),
-                body_material=None, bead_materials=(bead_material,) * many,
+                f"beads-{many}",
+                (x, y, z),
+                numbers,
+                np.full(many, bead_radius_mm),
+                body_material=None,
+                bead_materials=(bead_material,) * many,
                 description=f"{many} {bead_material} bead(s) of radius {bead_radius_mm:g} mm",
-            )  # fmt: skip
+            )
         x, y, z = numbers.tolist()
         size = (x, y, z)
         name = f"cuboid-{size[0]:g}x{size[1]:g}x{size[2]:g}-{beads}"
@@ -260,7 +266,9 @@ def _check_inside(centers: FloatArray, radii: FloatArray, size_mm: Vector) -> No
     room = np.asarray(size_mm) / 2.0 - np.abs(centers) - radii[:, None]
     if (room < -1e-9).any():
         i, axis = (int(v) for v in np.argwhere(room < -1e-9)[0])
-        place, along, most = centers[i].tolist(), "xyz"[axis], float(size_mm[axis] / 2 - radii[i])
+        place = centers[i].tolist()
+        along = "xyz"[axis]
+        most = float(size_mm[axis] / 2 - radii[i])
         raise LimitError(
             f"bead {i} at {place} mm with radius {radii[i]:g} mm sticks out of the body along "
             f"{along}: |{along}| may be at most {most:g} mm",

@@ -32,9 +32,11 @@ def lego_phantom() -> Phantom:
     5
     """
     data = lego_data()
-    thesis, assumed = data["thesis"], data["assumed"]
+    thesis = data["thesis"]
+    assumed = data["assumed"]
     stack = Brickwork(tuple(thesis["studs"]), int(thesis["bricks"]))
-    plastic, metal = material(assumed["material"]), material(assumed["bead_material"])
+    plastic = material(assumed["material"])
+    metal = material(assumed["bead_material"])
     bead_radius = thesis["bead_diameter_mm"] / 2.0
     beads = _bead_positions(stack, bead_radius)
     return Phantom(
@@ -58,7 +60,8 @@ def lego_data() -> dict[str, Any]:
 
 def _bead_positions(stack: Brickwork, radius: float) -> FloatArray:
     """Compute the bead centres of the LEGO phantom (k, 3) [mm]."""
-    v, k = stack.measures, np.arange(stack.bricks)
+    v = stack.measures
+    k = np.arange(stack.bricks)
     width, breadth, height = stack.size_mm
     inset = v["wall_mm"] + v["bead_clearance_mm"] + radius
     angle = 2.0 * math.pi * v["spiral_turns"] * k / stack.bricks
@@ -88,7 +91,8 @@ def brick_shapes(
 
     rows = rotation.T.tolist()
     axes = (tuple(rows[0]), tuple(rows[1]), tuple(rows[2]))
-    pitch, tall = v["stud_pitch_mm"], v["brick_height_mm"]
+    pitch = v["stud_pitch_mm"]
+    tall = v["brick_height_mm"]
     outer = (studs[0] * pitch, studs[1] * pitch, tall)
     out: list[tuple[analytic.Shape, float]] = [
         (analytic.Box(at(0, 0, floor + tall / 2), outer, axes), 1.0)
@@ -96,7 +100,8 @@ def brick_shapes(
     stud_z = floor + tall + v["stud_height_mm"] / 2
     for i in range(studs[0]):
         for j in range(studs[1]):
-            x, y = (i - (studs[0] - 1) / 2) * pitch, (j - (studs[1] - 1) / 2) * pitch
+            x = (i - (studs[0] - 1) / 2) * pitch
+            y = (j - (studs[1] - 1) / 2) * pitch
             stud = analytic.Cylinder(
                 at(x, y, stud_z), v["stud_diameter_mm"] / 2, v["stud_height_mm"]
             )
@@ -106,7 +111,8 @@ def brick_shapes(
     out.append((analytic.Box(at(0, 0, floor + depth / 2), inner, axes), -1.0))
     for i in range(studs[0] - 1):
         for j in range(studs[1] - 1):
-            x, y = (i - (studs[0] - 2) / 2) * pitch, (j - (studs[1] - 2) / 2) * pitch
+            x = (i - (studs[0] - 2) / 2) * pitch
+            y = (j - (studs[1] - 2) / 2) * pitch
             foot = at(x, y, floor + depth / 2)
             out.append((analytic.Cylinder(foot, v["tube_outer_diameter_mm"] / 2, depth), 1.0))
             out.append((analytic.Cylinder(foot, v["tube_inner_diameter_mm"] / 2, depth), -1.0))

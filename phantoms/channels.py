@@ -269,7 +269,8 @@ def _overlaps(fine: Volume, coarse: Volume, axis: int) -> FloatArray:
 
     def planes(volume: Volume) -> FloatArray:
         """Compute the planes between the voxels of a volume [mm]."""
-        n, edge = volume.data.shape[2 - axis], volume.voxel_xyz[axis]
+        n = volume.data.shape[2 - axis]
+        edge = volume.voxel_xyz[axis]
         return np.asarray((np.arange(n + 1) - n / 2.0) * edge + volume.center_mm[axis])
 
     a, b = planes(coarse), planes(fine)

@@ -218,25 +218,40 @@ def expose(
     phantom = as_phantom(sample, material=material, voxel_mm=voxel_mm)
     parts = channels(phantom)
     change: CameraChange = {
-        "exposure_ms": time_ms, "averages": averages, "mode": mode, "roi": roi,
-    }  # fmt: skip
+        "exposure_ms": time_ms,
+        "averages": averages,
+        "mode": mode,
+        "roi": roi,
+    }
     camera = changed_camera(spec, spec.camera, change)
     lit = ExposureSettings(tried[0], power, camera.exposure_ms, averages)
     wish = ScanRequest(
-        kind or "step", sod, sdd, images, camera.exposure_ms, averages, mode=camera.mode,
-        roi=camera.roi, kV=lit.kV, power_W=power,
-    )  # fmt: skip
+        kind or "step",
+        sod,
+        sdd,
+        images,
+        camera.exposure_ms,
+        averages,
+        mode=camera.mode,
+        roi=camera.roi,
+        kV=lit.kV,
+        power_W=power,
+    )
     plan: ScanPlan | None = None
-    seconds, total = images * averages * camera.exposure_ms / 1e3, images * 2 * _pixels(camera)
+    seconds = images * averages * camera.exposure_ms / 1e3
+    total = images * 2 * _pixels(camera)
     if kind is not None:
         plan = _plan_of(wish, scanner, profile, start)
-        images, seconds, total = plan.frames, plan.duration_s, plan.bytes
+        images = plan.frames
+        seconds = plan.duration_s
+        total = plan.bytes
     elif start is None:  # else the distances of a scanner as it stands
         distances = ScanRequest("step", sod, sdd, frames=2, exposure_ms=camera.exposure_ms)
         plan = _plan_of(distances, scanner, profile, start)
     if plan is not None:
         source_mm, panel_mm = _distances(plan)
-        sod, sdd = sod or source_mm, sdd or panel_mm
+        sod = sod or source_mm
+        sdd = sdd or panel_mm
     assert sod is not None
     assert sdd is not None
     cone = ConeVec.circular(
@@ -306,8 +321,9 @@ def _check_settings(
         ("kV", kVs, low, high),
         ("power_W", [power_W], 1e-9, machine.tube.max_W),
         ("exposure_ms", [exposure_ms], spec.min_exposure_ms, spec.max_exposure_ms),
-        ("averages", [averages], 1, 10**6), ("images", [images], 1, 10**7),
-    ):  # fmt: skip
+        ("averages", [averages], 1, 10**6),
+        ("images", [images], 1, 10**7),
+    ):
         for value in values:
             counted = what in ("averages", "images")
             if not least <= value <= most or (counted and value != int(value)):
@@ -354,7 +370,8 @@ class _Layers:
     """
 
     def __init__(self, parts: Sequence[Channel], machine: Machine, asked: str) -> None:
-        panel, tube = detector_of(machine.detector), tube_of(machine.tube)
+        panel = detector_of(machine.detector)
+        tube = tube_of(machine.tube)
         self.panel = panel
         self.chains: dict[str, Chain] = {}
         for layer in (asked, *FILTERS):
@@ -396,10 +413,13 @@ class _SeenDetail:
         full = saturating_counts(self.layers.panel)
         seen = max(plain.signal, changed.signal) < full
         return Setting(
-            at.kV, layer, at.exposure_ms, at.averages,
+            at.kV,
+            layer,
+            at.exposure_ms,
+            at.averages,
             contrast_to_noise(plain, changed) if seen else None,
             air_kerma_mGy(chain, at, self.sod_mm) * self.images,
-        )  # fmt: skip
+        )
 
     def unsaturated(self, layer: str, asked: ExposureSettings) -> ExposureSettings:
         """Split the time into so many read-outs that the open beam does not saturate."""
@@ -419,7 +439,8 @@ def exposure_problems(plan: ScanPlan, phantom: Phantom) -> tuple[ScriptProblem, 
         plan: of the scan.
         phantom: on the stage, about the axis.
     """
-    parts, scanner = channels(phantom), plan.machine
+    parts = channels(phantom)
+    scanner = plan.machine
     chain = chain_through(parts, detector_of(scanner.detector), tube_of(scanner.tube))
     probes = sample_probes(plan)
     shares = [_shares(parts, chain, probe) for probe in probes]

@@ -59,7 +59,8 @@ class Material:
             LimitError: the energy lies outside the table.
         """
         ends = tables().energy_keV if not self.points else [energy for energy, _ in self.points]
-        low, high = float(ends[0]), float(ends[-1])
+        low = float(ends[0])
+        high = float(ends[-1])
         if not low <= energy_keV <= high:
             raise LimitError(
                 f"{self.name}: {energy_keV:g} keV is outside the table's [{low:g}, {high:g}] keV",
@@ -140,7 +141,8 @@ def _by_formula(name: str) -> Material:
 
 def _fractions(entry: Mapping[str, object]) -> tuple[tuple[str, float], ...]:
     """Read mass fractions, or compute them from a formula."""
-    formula, fractions = entry.get("formula"), entry.get("fractions")
+    formula = entry.get("formula")
+    fractions = entry.get("fractions")
     if isinstance(fractions, Mapping):
         return tuple((str(s), float(f)) for s, f in fractions.items())
     return tuple(mass_fractions(parse_formula(str(formula))).items())

@@ -131,7 +131,8 @@ def _bodies(mesh: TriangleMesh) -> list[npt.NDArray[np.int64]]:
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    first, last = mesh.faces.ravel(), mesh.faces[:, [1, 2, 0]].ravel()
+    first = mesh.faces.ravel()
+    last = mesh.faces[:, [1, 2, 0]].ravel()
     size = len(mesh.vertices)
     edges = coo_array((np.ones(len(first), bool), (first, last)), shape=(size, size))
     _, part = connected_components(edges, directed=False)

@@ -71,7 +71,8 @@ class Voxels(ArrayValue):
     def __post_init__(self) -> None:
         data = np.array(self.data, dtype=np.float32)
         if data.ndim != 3 or data.size == 0:
-            said, shape = f"voxels have shape {data.shape}", list(data.shape)
+            said = f"voxels have shape {data.shape}"
+            shape = list(data.shape)
             raise PhantomError.instead(said, shape, "(z, y, x), none of them 0")
         if not np.isfinite(data).all():
             raise PhantomError("voxels hold values that are not finite")

@@ -136,9 +136,11 @@ def load_phantom(name: str) -> Phantom:
     if match is not None and match[1] in CUBOIDS_MM:
         return bead_phantom(match[1], int(match[2]))
     raise UnknownNameError.among(
-        f"no phantom called {name!r}; there are", name, phantom_names(),
+        f"no phantom called {name!r}; there are",
+        name,
+        phantom_names(),
         ", and cuboids with K beads such as normal-3",
-    )  # fmt: skip
+    )
 
 
 def as_phantom(
@@ -179,9 +181,12 @@ def as_phantom(
 
 
 def _one(
-    sample: object, material: str | Mapping[int, str] | None, voxel_mm: float | Vector | None,
-    keep: bool, priority: Sequence[float] = (),
-) -> Phantom:  # fmt: skip
+    sample: object,
+    material: str | Mapping[int, str] | None,
+    voxel_mm: float | Vector | None,
+    keep: bool,
+    priority: Sequence[float] = (),
+) -> Phantom:
     """Convert a sample of any kind to a phantom.
 
     Args:
@@ -260,7 +265,8 @@ def _array(
         raise PhantomError.instead(f"an array of {kind} is no sample", kind, "numbers")
     data = values.astype(np.float32)
     if material is not None:
-        low, high = float(data.min()), float(data.max())
+        low = float(data.min())
+        high = float(data.max())
         if low < -FILLED_TOLERANCE or high > 1.0 + FILLED_TOLERANCE:
             raise PhantomError(
                 f"with material={material!r} an array holds the part of each voxel that it fills, "
@@ -281,7 +287,8 @@ def _labelled(sample: object, names: Mapping[int, str], voxel_mm: float | Vector
             {"asked": _shown(sample), "allowed": "array, Volume"},
         )
     order = [0, *sorted(key for key in names if key != 0)]
-    index, known = np.zeros(labels.shape, np.uint8), labels == 0
+    index = np.zeros(labels.shape, np.uint8)
+    known = labels == 0
     for i, key in enumerate(order[1:256], 1):
         there = labels == key
         index[there] = i
@@ -323,4 +330,6 @@ def _solids(scene: Scene) -> Phantom:
 def _shown(sample: object) -> str:
     """Format a sample briefly, for error messages."""
     text = repr(sample)
-    return f"{type(sample).__name__} {text}" if len(text) <= 60 else type(sample).__name__
+    if len(text) <= 60:
+        return f"{type(sample).__name__} {text}"
+    return type(sample).__name__

@@ -55,9 +55,16 @@ def check_distances(
         LimitError: says what was asked and what is allowed.
     """
     wish = ScanRequest(
-        "step", sod_mm, sdd_mm, frames=2, exposure_ms=exposure.exposure_ms,
-        averages=exposure.averages, mode=camera.mode, kV=exposure.kV, power_W=exposure.power_W,
-    )  # fmt: skip
+        "step",
+        sod_mm,
+        sdd_mm,
+        frames=2,
+        exposure_ms=exposure.exposure_ms,
+        averages=exposure.averages,
+        mode=camera.mode,
+        kV=exposure.kV,
+        power_W=exposure.power_W,
+    )
     compose_script(wish, machine, profile_of(machine))
 
 

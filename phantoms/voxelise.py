@@ -113,7 +113,8 @@ def _add_surface(
     ends = np.cumsum(counts, dtype=np.int64).reshape(counts.shape)
     starts = ends - counts
     total = int(ends[-1, -1])
-    heights, signs = np.empty(total), np.empty(total, dtype=np.int8)
+    heights = np.empty(total)
+    signs = np.empty(total, dtype=np.int8)
     kernels.cross(triangles, starts, np.zeros_like(counts), heights, signs)
     leaks = kernels.add_surface(
         data, starts, counts, heights, signs, oversample, surface.mu_per_mm / oversample**2
@@ -142,7 +143,8 @@ def _columns(shape: Shape, x: FloatArray, y: FloatArray) -> _Interval:
     bottom, top = _between_slabs(one.slabs, x, y)
     if one.curved:
         low, high = _quadric(one.matrix, one.center, x, y)
-        bottom, top = np.maximum(bottom, low), np.minimum(top, high)
+        bottom = np.maximum(bottom, low)
+        top = np.minimum(top, high)
     return bottom, top
 
 
@@ -167,7 +169,8 @@ def _quadric(to_unit: FloatArray, center: FloatArray, x: FloatArray, y: FloatArr
 def _between_slabs(slabs: FloatArray, x: FloatArray, y: FloatArray) -> _Interval:
     """Compute the interval where low <= n . p <= high for all slabs (k, 5) = n, low, high."""
     zero = np.zeros(np.broadcast_shapes(x.shape, y.shape))
-    bottom, top = zero - np.inf, zero + np.inf
+    bottom = zero - np.inf
+    top = zero + np.inf
     for nx, ny, nz, low, high in slabs:
         across = nx * x + ny * y
         if abs(nz) < 1e-12:

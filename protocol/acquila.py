@@ -174,7 +174,9 @@ class Exchange:
     """
 
     def __init__(self, command: AcquilaEvent, comp_type: ComponentType, now: float) -> None:
-        self.command, self._type, self._last = command, comp_type, now
+        self.command = command
+        self._type = comp_type
+        self._last = now
 
     @property
     def next_feedback(self) -> float:

@@ -94,7 +94,8 @@ def json_pieces(document: object) -> list[bytes]:
         return f"{_PLACEHOLDER}{len(large) - 1}"
 
     text = json.dumps(document, allow_nan=False, separators=(",", ":"), default=default)
-    left, out = text.encode("ascii"), list[bytes]()
+    left = text.encode("ascii")
+    out = list[bytes]()
     for i, value in enumerate(large):
         head, _, left = left.partition(f"{_PLACEHOLDER}{i}".encode())
         out.append(head)

@@ -141,7 +141,8 @@ class Connection:
         Raises:
             ProtocolError: it ended inside a message, so that message is lost.
         """
-        inside, held = self.mid_message and not self.closed, self.pending
+        inside = self.mid_message and not self.closed
+        held = self.pending
         self._end()
         if inside:
             raise ProtocolError(f"the stream ended inside a message, of which {held} bytes came")
@@ -160,7 +161,8 @@ class Connection:
 
     def _feed_lines(self, data: bytes) -> None:
         """Divide JSON lines; a chunk of many short lines is split at once."""
-        first, last = data.find(b"\n") + 1, data.rfind(b"\n") + 1
+        first = data.find(b"\n") + 1
+        last = data.rfind(b"\n") + 1
         if first == last or len(data) > self.max_message or _may_hold_http(data):
             self._feed_each_line(data)
             return
@@ -200,7 +202,8 @@ class Connection:
         """Divide MessagePack frames; skip the rest of one that is too long."""
         skipped = min(self._skip, len(data))
         self._skip -= skipped
-        begun, at = self._begun, 0
+        begun = self._begun
+        at = 0
         begun += memoryview(data)[skipped:]
         held: bytes | bytearray = begun
         while (there := len(held)) - at >= 4:
@@ -271,7 +274,8 @@ class Connection:
         Returns:
             The bytes of the messages taken out, in order.
         """
-        out, looked = list[bytes](), 0
+        out = list[bytes]()
+        looked = 0
         if not self._suspect:
             searched = _joined(self._new)
             self._suspect = any(name in searched for name in names)
@@ -311,7 +315,9 @@ class Connection:
             RpcError: -32008, a MessagePack frame of 16 MiB or more.
         """
         pieces = self.pieces(message)
-        return pieces[0] if len(pieces) == 1 else b"".join(pieces)
+        if len(pieces) == 1:
+            return pieces[0]
+        return b"".join(pieces)
 
     def pieces(self, message: Message | Prepared) -> list[bytes]:
         """Encode like `send`, in pieces, so that large values are not copied."""
@@ -386,17 +392,23 @@ def _body(codec: Codec, message: Message) -> list[bytes]:
 def _pieces(codec: Codec, document: object) -> list[bytes]:
     """Encode a document in pieces."""
     json = codec is Codec.JSON
-    return codecs.json_pieces(document) if json else [codecs.write_msgpack(document)]
+    if json:
+        return codecs.json_pieces(document)
+    return [codecs.write_msgpack(document)]
 
 
 def _framed(codec: Codec, body: Sequence[bytes]) -> list[bytes]:
     """Add the newline of JSON lines, or the length of a MessagePack frame."""
-    return [*body, b"\n"] if codec is Codec.JSON else [frame_head(sum(map(len, body))), *body]
+    if codec is Codec.JSON:
+        return [*body, b"\n"]
+    return [frame_head(sum(map(len, body))), *body]
 
 
 def _array_head(count: int) -> bytes:
     """Return the MessagePack header of an array of `count` items."""
-    return bytes([0x90 | count]) if count < 16 else struct.pack(">BH", 0xDC, count)
+    if count < 16:
+        return bytes([0x90 | count])
+    return struct.pack(">BH", 0xDC, count)
 
 
 def frame_head(size: int) -> bytes:
@@ -447,7 +459,9 @@ def _large(data: object) -> memoryview | None:
     if not isinstance(data, (bytes, bytearray, memoryview)):
         return None
     view = memoryview(data)
-    return view if view.nbytes > MAX_COPIED_BYTES else None
+    if view.nbytes > MAX_COPIED_BYTES:
+        return view
+    return None
 
 
 def _split(body: memoryview) -> object | None:

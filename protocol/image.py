@@ -48,7 +48,9 @@ def decode(value: Mapping[str, object]) -> npt.NDArray[np.generic]:
         RpcError: -32602, naming what does not fit.
     """
     try:
-        dtype, shape, data = value["dtype"], value["shape"], value["data"]
+        dtype = value["dtype"]
+        shape = value["shape"]
+        data = value["data"]
     except (KeyError, TypeError):
         raise invalid_params("an image is {dtype, shape, data}") from None
     if dtype not in DTYPES or not isinstance(dtype, str):

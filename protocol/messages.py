@@ -203,7 +203,8 @@ def _single(document: object) -> Single:
 
 def _request(document: dict[object, object], id: Id) -> Single:
     """Read a request, or a notification if the document has no id."""
-    method, params = document["method"], document.get("params")
+    method = document["method"]
+    params = document.get("params")
     extra = [clip(k, 40) for k in document if k not in ("jsonrpc", "id", "method", "params")]
     if extra:
         return Malformed(invalid_request(f"unknown member {', '.join(extra[:5])}"), id)
@@ -214,13 +215,16 @@ def _request(document: dict[object, object], id: Id) -> Single:
     if isinstance(params, dict) and not all(isinstance(key, str) for key in params):
         return Malformed(invalid_request('the names in "params" must be text'), id)
     call: Params = params if isinstance(params, (dict, list)) else None
-    return Request(id, method, call) if "id" in document else Notification(method, call)
+    if "id" in document:
+        return Request(id, method, call)
+    return Notification(method, call)
 
 
 def _failure(id: Id, error: object) -> Single:
     """Read the answer to a failed request."""
     if isinstance(error, dict):
-        code, message = error.get("code"), error.get("message")
+        code = error.get("code")
+        message = error.get("message")
         if type(code) is int and isinstance(message, str):
             return Failure(id, RpcError(code, message, error.get("data")))
     return Malformed(RpcError(Code.INVALID_REQUEST, "invalid response: no code or message"), id)
@@ -335,7 +339,9 @@ class Correlation(Generic[_W]):
 
     def waiter(self, id: object) -> _W | None:
         """Return the waiter for the answer with this id, or None."""
-        return self._open_requests.get(id) if isinstance(id, (int, str)) else None
+        if isinstance(id, (int, str)):
+            return self._open_requests.get(id)
+        return None
 
     def waiting(self) -> list[_W]:
         """Return all waiters, oldest request first."""
@@ -369,7 +375,9 @@ class Correlation(Generic[_W]):
     @property
     def open(self) -> int:
         """Number of requests without an answer: sent by a client, received by a server."""
-        return len(self._open_requests) if self.role is Role.CLIENT else self._owed_answers.total()
+        if self.role is Role.CLIENT:
+            return len(self._open_requests)
+        return self._owed_answers.total()
 
     # -- both sides --------------------------------------------------------------------------
 
@@ -422,7 +430,9 @@ class Correlation(Generic[_W]):
                 f"an answer to a request that is not open (id {clip(answer.id, 40)})"
             )
         waiter = self._open_requests.pop(answer.id)
-        return [] if waiter is None else [Answered(waiter, answer)]
+        if waiter is None:
+            return []
+        return [Answered(waiter, answer)]
 
     def _receive_call(self, message: Message) -> list[Answered[_W] | Request | Notification]:
         """Register a client's call as open."""
@@ -454,7 +464,9 @@ def hello_params(client: str, token: str | None) -> dict[str, object]:
         {"protocol": version, "client": name}, and "token" if there is one.
     """
     params: dict[str, object] = {"protocol": PROTOCOL, "client": client}
-    return params if token is None else {**params, "token": token}
+    if token is None:
+        return params
+    return {**params, "token": token}
 
 
 def _require_text_names(value: object, where: str) -> None:

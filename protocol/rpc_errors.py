@@ -21,7 +21,8 @@ class Code(IntEnum):
     def __new__(cls, code: int, meaning: str) -> Code:
         """Make a code with its meaning."""
         member = int.__new__(cls, code)
-        member._value_, member.meaning = code, meaning
+        member._value_ = code
+        member.meaning = meaning
         return member
 
     PARSE = -32700, "not valid JSON or MessagePack"
@@ -156,7 +157,9 @@ def clip(value: object, limit: int = 200) -> str:
     it."""
     text = value[: limit + 1] if isinstance(value, str) else _brief(value, limit)
     text = text.encode("utf-8", "backslashreplace").decode("utf-8")  # no lone surrogates
-    return text if len(text) <= limit else text[:limit] + "..."
+    if len(text) <= limit:
+        return text
+    return text[:limit] + "..."
 
 
 def _brief(value: object, limit: int) -> str:

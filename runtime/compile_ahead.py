@@ -30,8 +30,11 @@ def _detection() -> None:
     """Compile the kernels of bead detection."""
     from flexdt.twin.calibration.detect import spot_kernels
 
-    image, mask = np.zeros((9, 9), np.float32), np.zeros((9, 9), np.uint8)
-    at, one, result = np.float64(4.0), np.ones(3), np.zeros(spot_kernels.RESULTS)
+    image = np.zeros((9, 9), np.float32)
+    mask = np.zeros((9, 9), np.uint8)
+    at = np.float64(4.0)
+    one = np.ones(3)
+    result = np.zeros(spot_kernels.RESULTS)
     spot_kernels.measure(image, at, at, at, 1.0, at, result)
     spot_kernels.fit_ball(image, mask, at, at, at, one, at, 0.5, 0.0, np.bool_(True), True, result)
 
@@ -41,16 +44,36 @@ def _fit() -> None:
     from flexdt.twin.calibration.fit import fit_kernels
 
     ints, floats, views = np.zeros(1, np.int64), np.zeros(1), np.zeros((0, 1))  # of no view
-    sets, radii = np.zeros((1, fit_kernels.PARAMETERS)), np.zeros(1)
+    sets = np.zeros((1, fit_kernels.PARAMETERS))
+    radii = np.zeros(1)
     radii.flags.writeable = False  # as a phantom's
     data = fit_kernels.Data(
-        np.zeros((0, 18)), ints[:0], 1.0, radii, views, np.zeros((0, 1, 2)), np.zeros((0, 1, 3)),
-        ints, sets.astype(np.int64), -1, np.zeros((0, 1, 2, 0)),
-    )  # fmt: skip
+        np.zeros((0, 18)),
+        ints[:0],
+        1.0,
+        radii,
+        views,
+        np.zeros((0, 1, 2)),
+        np.zeros((0, 1, 3)),
+        ints,
+        sets.astype(np.int64),
+        -1,
+        np.zeros((0, 1, 2, 0)),
+    )
     fit_kernels.evaluate(
-        data, sets, np.zeros((1, 3)), floats[:0], np.zeros((0, 1), np.bool_), math.inf, 0,
-        np.zeros((0, 1, 2)), views, views, np.zeros((1, 1)), floats,
-    )  # fmt: skip
+        data,
+        sets,
+        np.zeros((1, 3)),
+        floats[:0],
+        np.zeros((0, 1), np.bool_),
+        math.inf,
+        0,
+        np.zeros((0, 1, 2)),
+        views,
+        views,
+        np.zeros((1, 1)),
+        floats,
+    )
 
 
 def _reconstruction() -> None:
@@ -61,7 +84,8 @@ def _reconstruction() -> None:
     scan = ConeVec.circular(sod=10, sdd=20, angles=8, shape=(4, 6), pixel=1.0)
     images = np.ones((8, 4, 6), np.float32)
     fdk(images, scan, Grid((2, 3, 4), 0.5).blank())  # which go on beyond the panel's edges
-    one, six = np.ones((1, 1)), np.zeros(truncation_kernels.PARAMETERS)
+    one = np.ones((1, 1))
+    six = np.zeros(truncation_kernels.PARAMETERS)
     ray = np.ones((1, 1, 2))
     truncation_kernels.fit_prism(ray[0], ray, one, one, six - 1.0, six + 1.0, 1.0, six)
     fdk_kernels.warp(images, np.ones((8, 3, 3)), fdk_kernels.lanczos(), images.copy())
@@ -107,7 +131,8 @@ def compile_ahead(groups: Sequence[str], note: Callable[[str], None]) -> None:
         while left:
             done = wait(left, SILENT_S, return_when="FIRST_COMPLETED").done
             now = [left.pop(each) for each in done] or ["still"]
-            compiled, seconds = len(missing) - len(left), time.monotonic() - begun
+            compiled = len(missing) - len(left)
+            seconds = time.monotonic() - begun
             note(f"compiled {compiled} of {len(missing)} ({', '.join(now)}, {seconds:.0f} s)")
 
 

@@ -149,7 +149,8 @@ class _Server(ThreadingWSGIServer):
     request_queue_size = BACKLOG
 
     def __init__(self, *given: Any, **more: Any) -> None:
-        self._strangers, self._answered = Room[_Visitor](STRANGERS), Room[_Visitor](ANSWERED)
+        self._strangers = Room[_Visitor](STRANGERS)
+        self._answered = Room[_Visitor](ANSWERED)
         self._here: dict[object, _Visitor] = {}
         self._lock = Lock()
         super().__init__(*given, **more)
@@ -216,7 +217,8 @@ def _application(pages: Pages, token: str | None, *, loopback: bool) -> Callable
 
     def response(asked: Mapping[str, Any]) -> HttpResponse:
         """Check a request and have the loop make its page."""
-        path, given = asked["PATH_INFO"], asked.get("HTTP_AUTHORIZATION", "")
+        path = asked["PATH_INFO"]
+        given = asked.get("HTTP_AUTHORIZATION", "")
         if loopback and "HTTP_HOST" in asked and _foreign(asked["HTTP_HOST"]):
             return HttpResponse("{}", HTTPStatus.FORBIDDEN)
         if asked["REQUEST_METHOD"] not in ("GET", "HEAD"):
@@ -246,10 +248,15 @@ def _application(pages: Pages, token: str | None, *, loopback: bool) -> Callable
         """Answer a request, as WSGI has it."""
         page = response(asked)
         body = page.text.encode()
-        head = {"Content-Type": page.content_type, "Content-Length": str(len(body)),
-                "Cache-Control": "no-store"}  # fmt: skip
+        head = {
+            "Content-Type": page.content_type,
+            "Content-Length": str(len(body)),
+            "Cache-Control": "no-store",
+        }
         start(f"{page.status.value} {page.status.phrase}", list(head.items()))
-        return [] if asked["REQUEST_METHOD"] == "HEAD" else [body]
+        if asked["REQUEST_METHOD"] == "HEAD":
+            return []
+        return [body]
 
     return application
 
@@ -274,7 +281,8 @@ async def served_pages(pages: Pages, settings: ServerSettings) -> AsyncIterator[
     if settings.http_port is None:
         yield {}
         return
-    host, token = settings.http_host, read_token(settings.token_file)
+    host = settings.http_host
+    token = read_token(settings.token_file)
     check_bind(host, token)
 
     class Server(_Server):

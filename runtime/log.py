@@ -113,7 +113,8 @@ class _Listener(QueueListener):
 
     def stop(self) -> None:
         """Stop like the library's, but without waiting forever for a blocked reader."""
-        thread, self._thread = self._thread, None
+        thread = self._thread
+        self._thread = None
         if thread is not None:
             with contextlib.suppress(queue.Full):
                 self.queue.put(None, timeout=1.0)  # type: ignore[attr-defined]
@@ -145,7 +146,8 @@ class Sparing:
     """
 
     def __init__(self, burst: int = BURST, clock: Callable[[], float] = time.monotonic) -> None:
-        self._burst, self._clock = burst, clock
+        self._burst = burst
+        self._clock = clock
         self._kinds: dict[str, tuple[float, float, int]] = {}  # when, lines allowed, left out
 
     def log(
@@ -158,7 +160,9 @@ class Sparing:
         **facts: object,
     ) -> None:
         """Write a line like `log`, or count it; its kind is the event unless given."""
-        kind, now, burst = kind or event, self._clock(), float(self._burst)
+        kind = kind or event
+        now = self._clock()
+        burst = float(self._burst)
         at, allowed, left_out = self._kinds.get(kind, (now, burst, 0))
         allowed = min(burst, allowed + (now - at) / EVERY_S)
         if allowed < 1.0:

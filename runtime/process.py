@@ -83,7 +83,8 @@ class Holds:
 
     def worst(self) -> float:
         """Return the longest turn since the last call, and reset it."""
-        worst, self._worst = self._worst, 0.0
+        worst = self._worst
+        self._worst = 0.0
         return worst
 
 
@@ -120,11 +121,11 @@ class ServerLoop(asyncio.SelectorEventLoop):
 
         def complain(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
             """Log what asyncio reports; errors of the system without a traceback."""
-            what, error = str(context.get("message")), context.get("exception")
+            what = str(context.get("message"))
+            error = context.get("exception")
             kind = f"{what} {type(error).__name__}"
             if error is None or isinstance(error, OSError):
-                lines.log("event loop", logging.WARNING, kind=kind,
-                          message=what, reason=str(error))  # fmt: skip
+                lines.log("event loop", logging.WARNING, kind=kind, message=what, reason=str(error))
                 return
             try:
                 raise error
@@ -166,9 +167,14 @@ class ListeningServer:
             OSError: the address is taken or not ours.
         """
         self.server = await asyncio.get_running_loop().create_server(
-            made, host, port, ssl=ssl, backlog=1,
-            ssl_handshake_timeout=None if ssl is None else TLS_HANDSHAKE_S, start_serving=serving,
-        )  # fmt: skip
+            made,
+            host,
+            port,
+            ssl=ssl,
+            backlog=1,
+            ssl_handshake_timeout=None if ssl is None else TLS_HANDSHAKE_S,
+            start_serving=serving,
+        )
         one_at_a_time(self.server)
 
     async def serve(self) -> None:
@@ -233,7 +239,8 @@ T = TypeVar("T")
 def stop_signal() -> asyncio.Event:
     """Make an event that SIGTERM or SIGINT sets; a second signal does not interrupt the
     stopping."""
-    stop, loop = asyncio.Event(), asyncio.get_running_loop()
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
     for number in SIGNALS:
         loop.add_signal_handler(number, stop.set)
     return stop
@@ -282,15 +289,18 @@ def run_process(settings: S, run: Callable[[S], Coroutine[None, None, int]]) -> 
         with asyncio.Runner(loop_factory=ServerLoop) as runner:
             return runner.run(run(settings))
     except AccessError as error:
-        problem, code = str(error), INVALID if isinstance(error, AccessFileError) else USAGE
+        problem = str(error)
+        code = INVALID if isinstance(error, AccessFileError) else USAGE
     except (TwinError, ValueError) as error:
-        problem, code = str(error), INVALID
+        problem = str(error)
+        code = INVALID
     except OSError as error:
         if error.filename is None:
             problem = f"cannot listen on {settings.host}:{settings.port}: {error.strerror}"
             code = REFUSED
         else:
-            problem, code = f"{error.filename}: {error.strerror}", INVALID
+            problem = f"{error.filename}: {error.strerror}"
+            code = INVALID
     print(f"flexdt {settings.command}: {problem}", file=sys.stderr)
     return code
 
@@ -341,7 +351,9 @@ def session_seconds(session: int) -> float | None:
     except OSError:
         return None
     found = [words for words in map(_words, names) if words and int(words[3]) == session]
-    return sum(map(_seconds, found)) if found else None
+    if found:
+        return sum(map(_seconds, found))
+    return None
 
 
 def _words(pid: str) -> list[str]:

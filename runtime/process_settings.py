@@ -38,7 +38,9 @@ class Address:
     port: int
 
     def __str__(self) -> str:
-        return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+        if ":" in self.host:
+            return f"[{self.host}]:{self.port}"
+        return f"{self.host}:{self.port}"
 
 
 def address(text: str) -> Address:
@@ -62,7 +64,9 @@ def addresses(text: str | None) -> tuple[Address, ...]:
     Raises:
         typer.BadParameter: as `address`.
     """
-    return () if text is None else tuple(address(word) for word in text.split(","))
+    if text is None:
+        return ()
+    return tuple(address(word) for word in text.split(","))
 
 
 def several(text: str) -> str:

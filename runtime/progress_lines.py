@@ -18,7 +18,8 @@ one."""
 @contextmanager
 def told(what: str) -> Iterator[None]:
     """Report work inside that takes long, to the log and so to standard error."""
-    done, begun = threading.Event(), time.monotonic()
+    done = threading.Event()
+    begun = time.monotonic()
     if begun > _last[1] + SILENT_S:
         _last[0] = begun
 

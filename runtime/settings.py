@@ -47,7 +47,8 @@ def option(default: object, *flags: str, public: bool = True, **details: Any) ->
 
 def parameters(settings: type[Settings]) -> dict[str, inspect.Parameter]:
     """Convert a table's keys to options: parameters of a function that typer reads."""
-    hints, found = get_type_hints(settings), {}
+    hints = get_type_hints(settings)
+    found = {}
     helps = {n: h for kind in settings.__mro__[::-1] for n, h in described(kind)[1].items()}
     for f in fields(settings):
         flags = f.metadata["flags"] or (f"--{f.name.replace('_', '-')}",)
@@ -55,10 +56,11 @@ def parameters(settings: type[Settings]) -> dict[str, inspect.Parameter]:
         kind: Any = list[str] if isinstance(default, tuple) else hints[f.name]
         details = {"help": helps.get(f.name, ""), **f.metadata["details"]}
         found[f.name] = inspect.Parameter(
-            f.name, inspect.Parameter.KEYWORD_ONLY,
+            f.name,
+            inspect.Parameter.KEYWORD_ONLY,
             default=[*default] if isinstance(default, tuple) else default,
             annotation=Annotated[kind, typer.Option(*flags, **details)],
-        )  # fmt: skip
+        )
     return found
 
 

@@ -155,7 +155,9 @@ class Supervisor:
         Raises:
             ServiceError: it left by itself at its first start.
         """
-        clock, ends, first = asyncio.get_running_loop().time, Ends(), True
+        clock = asyncio.get_running_loop().time
+        ends = Ends()
+        first = True
         service = start.service
         while True:
             begun = None
@@ -207,16 +209,20 @@ class Supervisor:
         Raises:
             _Ended: before it said so, or it no longer does anything.
         """
-        clock, service = asyncio.get_running_loop().time, start.service
+        clock = asyncio.get_running_loop().time
+        service = start.service
         ready = asyncio.create_task(self._lines(process, start))
         end = asyncio.create_task(_ended(process))
-        used_s, since, note_at = session_seconds(process.pid), clock(), clock() + SILENT_S
+        used_s = session_seconds(process.pid)
+        since = clock()
+        note_at = clock() + SILENT_S
         note = f"waiting for the {service.name}" + (service.slow and f": {service.slow}")
         try:
             while not (ready.done() or end.done()):
                 now_s = session_seconds(process.pid)
                 if now_s is None or now_s != used_s:
-                    used_s, since = now_s, clock()
+                    used_s = now_s
+                    since = clock()
                 if clock() - since >= STALLED_S:
                     raise _Ended(f"it did nothing for {STALLED_S:g} s")
                 if clock() >= note_at and (note or used_s is not None):
@@ -224,7 +230,8 @@ class Supervisor:
                         f"the {service.name} is still starting: {used_s or 0:.0f} s of work so far"
                     )
                     self.note(note or work)
-                    note, note_at = "", clock() + SILENT_S
+                    note = ""
+                    note_at = clock() + SILENT_S
                 await asyncio.wait(
                     {ready, end}, timeout=CHECK_INTERVAL_S, return_when=FIRST_COMPLETED
                 )

@@ -38,7 +38,8 @@ def explain(error: Exception, root: Path | None = None) -> RpcError:
     relative to it."""
     if root is not None:
         known = explain(error)
-        message, data = from_root(known.message, root), from_root(known.data, root)
+        message = from_root(known.message, root)
+        data = from_root(known.data, root)
         return RpcError(known.code, str(message), data)
     match error:
         case RpcError():

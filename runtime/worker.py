@@ -50,7 +50,8 @@ def receive_parts(channel: socket.socket) -> list[bytes]:
 
 def _exactly(channel: socket.socket, size: int) -> bytearray:
     data = bytearray(size)
-    view, at = memoryview(data), 0
+    view = memoryview(data)
+    at = 0
     while at < size:
         got = channel.recv_into(view[at : at + (1 << 20)])
         if not got:

@@ -47,14 +47,20 @@ class Worker:
         environment = {k: v for k, v in os.environ.items() if k != "FLEXDT_TOKEN"}
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "flexdt.runtime.worker",
-                 str(theirs.fileno()), str(memory_bytes)],
+                [
+                    sys.executable,
+                    "-P",
+                    "-m",
+                    "flexdt.runtime.worker",
+                    str(theirs.fileno()),
+                    str(memory_bytes),
+                ],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
                 pass_fds=[theirs.fileno()],
                 env={**environment, **ENVIRONMENT},
-            )  # fmt: skip
+            )
         except BaseException:
             ours.close()
             raise
@@ -124,7 +130,8 @@ class Worker:
             while not answer.select(min(CHECK_INTERVAL_S, seconds)):
                 now = process_seconds(self.pid)
                 if now != used:
-                    used, since = now, time.monotonic()
+                    used = now
+                    since = time.monotonic()
                 worked = 0.0 if now is None or begun is None else now - begun
                 if worked > seconds or time.monotonic() - since > seconds:
                     raise TimeoutError
@@ -161,7 +168,8 @@ class Workers:
     """
 
     def __init__(self, count: int, memory_bytes: int, seconds: float) -> None:
-        self.memory_bytes, self.seconds = memory_bytes, seconds
+        self.memory_bytes = memory_bytes
+        self.seconds = seconds
         self._turn = asyncio.Semaphore(count)
         self._threads = ThreadPoolExecutor(count, thread_name_prefix="worker")
         self._idle: list[Worker] = []

@@ -147,7 +147,8 @@ def filled_mesh(
     mu = material_of(material).mu_per_mm
     mesh = _closed(mesh.copy(), label)
     vertices = np.asarray(mesh.vertices, dtype=np.float64) * UNITS_MM[unit]
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    low = vertices.min(axis=0)
+    high = vertices.max(axis=0)
     if (high - low).max() > MAX_EXTENT_MM or (high - low).max() <= 0.0:
         raise PhantomError(
             f"{label} measures {(high - low).max():g} mm in unit {unit!r}; allowed: more than 0, "
@@ -156,7 +157,8 @@ def filled_mesh(
         )
     shift = ((low + high) / 2.0 if place == "center" else np.zeros(3)) - np.asarray(at_mm)
     vertices = vertices - shift
-    low, high = low - shift, high - shift
+    low = low - shift
+    high = high - shift
     x, y, z = (2.0 * np.maximum(np.abs(low), np.abs(high))).tolist()
     solid = _convex(mesh, vertices)
     what = f"{len(mesh.faces)} triangles of {label} in {unit}, filled with {material}"
@@ -263,10 +265,13 @@ def _read(source: bytes | str | os.PathLike[str], file_type: str | None) -> tupl
     """Read a file, or take bytes; return content, format and label, with size and format
     checked."""
     if isinstance(source, bytes):
-        raw, label, kind = source, "mesh", file_type or ""
+        raw = source
+        label = "mesh"
+        kind = file_type or ""
     else:
         path = Path(source)
-        label, kind = path.name, file_type or path.suffix.lstrip(".")
+        label = path.name
+        kind = file_type or path.suffix.lstrip(".")
         try:
             size = path.stat().st_size
             raw = path.read_bytes() if size <= MAX_BYTES else b""
@@ -374,11 +379,13 @@ def _check_gltf(document: Any, total: int) -> None:
         if "bufferView" not in one or "sparse" in one:
             raise ValueError(f"accessor {i}: its data are not in the file as they are")
     views = [view["byteLength"] for view in document.get("bufferViews", [])]
-    sizes = [a["count"] * ITEM_BYTES[a["componentType"]] * ITEM_COLUMNS[a["type"]]
-             for a in accessors]  # fmt: skip
+    sizes = [
+        a["count"] * ITEM_BYTES[a["componentType"]] * ITEM_COLUMNS[a["type"]] for a in accessors
+    ]
     if min((*views, *sizes), default=0) < 0 or not max(sum(views), sum(sizes)) <= total:
         raise ValueError(f"it claims more than its {total} bytes hold")
-    nodes, meshes = document.get("nodes", []), document.get("meshes", [])
+    nodes = document.get("nodes", [])
+    meshes = document.get("meshes", [])
     scenes = document.get("scenes", [{}])
     places = [*scenes[document.get("scene", 0)].get("nodes", [])]
     places += [child for node in nodes for child in node.get("children", [])]

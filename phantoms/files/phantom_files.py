@@ -99,18 +99,27 @@ def _version(value: object, where: str) -> object:
 
 def _scene_file(document: Mapping[str, object], folder: Path | None) -> Phantom:
     """Make the phantom of a scene: solids and meshes with their priorities."""
-    given = reading.fields(document, "phantom", {}, {
-        "schema": _version, "name": reading.string, "description": reading.string,
-        "solid": partial(reading.each, read=solids_of),
-        "mesh": partial(reading.each, read=partial(_mesh, folder=folder)),
-    })  # fmt: skip
-    name, listed = given.get("name", "scene"), given.get("solid", ())
+    given = reading.fields(
+        document,
+        "phantom",
+        {},
+        {
+            "schema": _version,
+            "name": reading.string,
+            "description": reading.string,
+            "solid": partial(reading.each, read=solids_of),
+            "mesh": partial(reading.each, read=partial(_mesh, folder=folder)),
+        },
+    )
+    name = given.get("name", "scene")
+    listed = given.get("solid", ())
     if len(listed) > MAX_SOLIDS:
         raise reading.wrong(f"{len(listed)} solids", "phantom.solid", f"at most {MAX_SOLIDS}")
     scene = Scene(tuple(solid for several in listed for solid in several))
     parts = [] if not listed else [(Phantom(name, "", scene, size_about_origin(scene)), 0.0)]
     parts += given.get("mesh", ())
-    told, ranks = given.get("description", ""), [rank for _, rank in parts]
+    told = given.get("description", "")
+    ranks = [rank for _, rank in parts]
     whole = assemble(name, [part for part, _ in parts], told, ranks)
     require_replaced(whole, document.get("solid", []))
     return whole
@@ -202,7 +211,8 @@ def _bead_file(document: Mapping[str, object]) -> Phantom:
             raise PhantomError("phantom.spiral: a spiral needs a [body] to fit into")
         count, radius, metal = given["spiral"]
         centers = spiral_positions(size, count, radius)
-        radii, metals = np.full(count, radius), (metal,) * count
+        radii = np.full(count, radius)
+        metals = (metal,) * count
     else:
         beads: tuple[tuple[Vector, float, str], ...] = given["bead"]
         metals = tuple(metal for *_, metal in beads)
@@ -218,8 +228,15 @@ def _bead_file(document: Mapping[str, object]) -> Phantom:
     if size is None:
         size = tuple((2.0 * np.max(np.abs(centers) + radii[:, None], axis=0)).tolist())
     told = given.get("description", f"{len(centers)} beads in {body or 'air'}")
-    return cuboid_with_beads(given["name"], size, centers, radii, body_material=body,
-                             bead_materials=metals, description=told)  # fmt: skip
+    return cuboid_with_beads(
+        given["name"],
+        size,
+        centers,
+        radii,
+        body_material=body,
+        bead_materials=metals,
+        description=told,
+    )
 
 
 def _body(value: object, where: str) -> tuple[Vector, str]:
@@ -263,7 +280,8 @@ def sent_scene(text: bytes, *, name: str) -> Phantom:
     except UnicodeDecodeError:
         raise PhantomError(f"{name}: not UTF-8 text", {"asked": name}) from None
     phantom = load_phantom_file(document, name)
-    solids, faces = phantom.scene.solids, sum(len(one.faces) for one in phantom.surfaces)
+    solids = phantom.scene.solids
+    faces = sum(len(one.faces) for one in phantom.surfaces)
     for what, count, most in (
         ("solids", len(solids), MAX_SENT_SOLIDS),
         ("triangles", faces, MAX_FACES),

@@ -44,7 +44,8 @@ def _shells(vertices: FloatArray, faces: Faces) -> list[npt.NDArray[np.intp]]:
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    first, last = faces.ravel(), faces[:, [1, 2, 0]].ravel()
+    first = faces.ravel()
+    last = faces[:, [1, 2, 0]].ravel()
     size = len(vertices)
     edges = coo_array((np.ones(len(first), bool), (first, last)), shape=(size, size))
     _, part = connected_components(edges, directed=False)

@@ -150,8 +150,9 @@ class DatasetFrameResult(ImageValue):
 
 
 DATASET_LIST = read("dataset.list", DatasetList, DatasetListResult, "data sets, the newest first")
-DATASET_GET = read("dataset.get", DatasetGet, DatasetResult,
-                   "a data set: settings, poses over time")  # fmt: skip
+DATASET_GET = read(
+    "dataset.get", DatasetGet, DatasetResult, "a data set: settings, poses over time"
+)
 DATASET_FRAME = read("dataset.frame", DatasetFrame, DatasetFrameResult, "an image of a data set")
 
 
@@ -307,16 +308,33 @@ class CorrectionListResult(f.Result):
     current: str | None = None
 
 
-CALIBRATION_APPLY = command("calibration.apply", CalibrationApply, CorrectionResult,
-                            "put a correction in force")  # fmt: skip
-CALIBRATION_GET = read("calibration.get", CalibrationGet, CorrectionResult,
-                       "the correction in force")  # fmt: skip
+CALIBRATION_APPLY = command(
+    "calibration.apply", CalibrationApply, CorrectionResult, "put a correction in force"
+)
+CALIBRATION_GET = read(
+    "calibration.get", CalibrationGet, CorrectionResult, "the correction in force"
+)
 CALIBRATION_LIST = read("calibration.list", f.Empty, CorrectionListResult, "all corrections")
-CALIBRATION_REVERT = command("calibration.revert", f.Empty, CorrectionResult,
-                             "back to the correction before")  # fmt: skip
-CALIBRATION_DELETE = command("calibration.delete", CalibrationDelete, CorrectionDeleted,
-                             "delete a correction that is not in force")  # fmt: skip
-CALIBRATION_FIT = read("calibration.fit", CalibrationFit, CalibrationFitResult,
-                       "calibrate from data sets", limits=FIT_LIMITS)  # fmt: skip
-CALIBRATION_ALIGN = read("calibration.align", CalibrationAlign, CalibrationAlignResult,
-                         "align without beads", limits=FIT_LIMITS)  # fmt: skip
+CALIBRATION_REVERT = command(
+    "calibration.revert", f.Empty, CorrectionResult, "back to the correction before"
+)
+CALIBRATION_DELETE = command(
+    "calibration.delete",
+    CalibrationDelete,
+    CorrectionDeleted,
+    "delete a correction that is not in force",
+)
+CALIBRATION_FIT = read(
+    "calibration.fit",
+    CalibrationFit,
+    CalibrationFitResult,
+    "calibrate from data sets",
+    limits=FIT_LIMITS,
+)
+CALIBRATION_ALIGN = read(
+    "calibration.align",
+    CalibrationAlign,
+    CalibrationAlignResult,
+    "align without beads",
+    limits=FIT_LIMITS,
+)

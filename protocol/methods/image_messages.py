@@ -163,11 +163,19 @@ class ExposurePrediction(f.Result):
     """what is not known of the sample"""
 
 
-PROJECTION_GET = read("projection.get", ProjectionGet, Projection,
-                      "an image at the current pose, or another")  # fmt: skip
-PROJECTION_RAY = read("projection.ray", RayGet, RayResult,
-                      "paths through materials on the ray of a pixel")  # fmt: skip
-GEOMETRY_GET = read("geometry.get", f.Empty, GeometryResult,
-                    "cone_vec, detector shape and pixel pitch")  # fmt: skip
-EXPOSURE_PREDICT = read("exposure.predict", ExposurePredict, ExposurePrediction,
-    "transmission, contrast to noise and dose of a scan", limits=PREDICTION_LIMITS)  # fmt: skip
+PROJECTION_GET = read(
+    "projection.get", ProjectionGet, Projection, "an image at the current pose, or another"
+)
+PROJECTION_RAY = read(
+    "projection.ray", RayGet, RayResult, "paths through materials on the ray of a pixel"
+)
+GEOMETRY_GET = read(
+    "geometry.get", f.Empty, GeometryResult, "cone_vec, detector shape and pixel pitch"
+)
+EXPOSURE_PREDICT = read(
+    "exposure.predict",
+    ExposurePredict,
+    ExposurePrediction,
+    "transmission, contrast to noise and dose of a scan",
+    limits=PREDICTION_LIMITS,
+)

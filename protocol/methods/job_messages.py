@@ -164,21 +164,46 @@ class JobListResult(f.Result):
     jobs: list[JobStatus]
 
 
-SCRIPT_CHECK = read("script.check", ScriptInput, CheckResult,
-                    "parse, plan and check a script", limits=CHECK_LIMITS, bulky=True)  # fmt: skip
-SCRIPT_SUBMIT = command("script.submit", ScriptInput, SubmitResult,
-                        "run a script as a job", limits=CHECK_LIMITS, bulky=True)  # fmt: skip
-TRAJECTORY_CHECK = read("trajectory.check", TrajectoryInput, CheckResult,
-                        "plan and check poses", limits=CHECK_LIMITS, bulky=True)  # fmt: skip
-TRAJECTORY_SUBMIT = command("trajectory.submit", TrajectoryInput, SubmitResult,
-                            "run poses as a job", limits=CHECK_LIMITS, bulky=True)  # fmt: skip
+SCRIPT_CHECK = read(
+    "script.check",
+    ScriptInput,
+    CheckResult,
+    "parse, plan and check a script",
+    limits=CHECK_LIMITS,
+    bulky=True,
+)
+SCRIPT_SUBMIT = command(
+    "script.submit",
+    ScriptInput,
+    SubmitResult,
+    "run a script as a job",
+    limits=CHECK_LIMITS,
+    bulky=True,
+)
+TRAJECTORY_CHECK = read(
+    "trajectory.check",
+    TrajectoryInput,
+    CheckResult,
+    "plan and check poses",
+    limits=CHECK_LIMITS,
+    bulky=True,
+)
+TRAJECTORY_SUBMIT = command(
+    "trajectory.submit",
+    TrajectoryInput,
+    SubmitResult,
+    "run poses as a job",
+    limits=CHECK_LIMITS,
+    bulky=True,
+)
 JOB_STATUS = read("job.status", JobRef, JobStatus, "how far a job is")
-JOB_PAUSE = command("job.pause", JobRef, JobStatus,
-                    "pause a job; a frame under exposure is taken again")  # fmt: skip
+JOB_PAUSE = command(
+    "job.pause", JobRef, JobStatus, "pause a job; a frame under exposure is taken again"
+)
 JOB_RESUME = command("job.resume", JobRef, JobStatus, "return to the pose of the pause and go on")
 JOB_STEP = command("job.step", JobRef, JobStatus, "run a paused job for one step")
-JOB_ABORT = Method("job.abort", JobAbort, JobStatus,
-                   "end a job, its data set incomplete", urgent=True)  # fmt: skip
+JOB_ABORT = Method(
+    "job.abort", JobAbort, JobStatus, "end a job, its data set incomplete", urgent=True
+)
 JOB_LIST = read("job.list", f.Empty, JobListResult, "all jobs, oldest first")
-JOB_FORGET = command("job.forget", JobForget, JobForgetResult,
-                     "forget ended jobs; data sets stay")  # fmt: skip
+JOB_FORGET = command("job.forget", JobForget, JobForgetResult, "forget ended jobs; data sets stay")

@@ -135,8 +135,9 @@ class CameraSet(Params):
 
 CLOCK_SET = command("clock.set", ClockSet, ClockState, "set how fast the twin's time runs")
 TUBE_SET = by_hand("tube.set", TubeSet, TubeState, "set kV, power and X-rays on or off")
-CAMERA_SET = by_hand("camera.set", CameraSet, CameraState,
-                     "set exposure, mode, ROI, averages, frames")  # fmt: skip
+CAMERA_SET = by_hand(
+    "camera.set", CameraSet, CameraState, "set exposure, mode, ROI, averages, frames"
+)
 
 
 class SampleSet(f.Params):
@@ -268,8 +269,14 @@ class SampleMeshResult(f.Result):
 
 SAMPLE_SET = by_hand("sample.set", SampleSet, SampleResult, "put a sample on the stage")
 SAMPLE_LIST = read("sample.list", f.Empty, SampleListResult, "the samples there are")
-SAMPLE_MESH = read("sample.mesh", SampleMesh, SampleMeshResult,
-                   "the shape of the sample on the stage")  # fmt: skip
-SAMPLE_UPLOAD = Method("sample.upload", SampleUpload, UploadResult,
-                       "send a mesh, voxels or a scene in chunks", bulky=True)  # fmt: skip
+SAMPLE_MESH = read(
+    "sample.mesh", SampleMesh, SampleMeshResult, "the shape of the sample on the stage"
+)
+SAMPLE_UPLOAD = Method(
+    "sample.upload",
+    SampleUpload,
+    UploadResult,
+    "send a mesh, voxels or a scene in chunks",
+    bulky=True,
+)
 SAMPLE_DELETE = command("sample.delete", SampleDelete, SampleDeleteResult, "delete an upload")

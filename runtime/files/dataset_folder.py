@@ -67,12 +67,16 @@ class Folder:
     @property
     def document(self) -> str | None:
         """Name of flexdt.json, if it is there."""
-        return DOCUMENT if DOCUMENT in self.names else None
+        if DOCUMENT in self.names:
+            return DOCUMENT
+        return None
 
     @property
     def geometry(self) -> str | None:
         """Name of geometry.json, if it is there."""
-        return GEOMETRY if GEOMETRY in self.names else None
+        if GEOMETRY in self.names:
+            return GEOMETRY
+        return None
 
     @property
     def scan_settings(self) -> str | None:
@@ -149,7 +153,8 @@ class Folder:
             match = _IMAGE.fullmatch(name)
             if match is None:
                 continue
-            prefix, number = match[1].lower(), int(match[2])
+            prefix = match[1].lower()
+            number = int(match[2])
             first = found[prefix].setdefault(number, name)
             if first != name:
                 twice.setdefault(prefix, (first, name))
@@ -170,7 +175,8 @@ def confined(root: Directory) -> Iterator[None]:
     not.
     """
     global _confined
-    before, _confined = _confined, root
+    before = _confined
+    _confined = root
     try:
         yield
     finally:
@@ -195,7 +201,9 @@ def opened(path: Path) -> BinaryIO:
         OSError: there is none, or where reading is `confined`, it is no regular file.
     """
     folder = _within(path.parent)
-    return path.open("rb") if folder is None else folder.open(path.name)
+    if folder is None:
+        return path.open("rb")
+    return folder.open(path.name)
 
 
 def list_folder(path: Path) -> Folder:
@@ -306,7 +314,9 @@ def _decoded(path: Path, kinds: str) -> npt.NDArray[np.uint16 | np.float32]:
     # A file may name others as its images, wherever they are: only what is in it is read.
     with opened(path) as raw, tifffile.TiffFile(raw, _multifile=False) as file:
         series = file.series[0]
-        shape, kind, page = tuple(series.shape), series.dtype, file.pages[0]
+        shape = tuple(series.shape)
+        kind = series.dtype
+        page = file.pages[0]
         allowed = [np.dtype(k) for k in ("u2", "f4", "f8") if k[0] in kinds]
         if len(shape) != 2 or kind.newbyteorder("=") not in allowed:
             words = " or ".join(map(str, allowed))
@@ -316,7 +326,8 @@ def _decoded(path: Path, kinds: str) -> npt.NDArray[np.uint16 | np.float32]:
             )
         size = kind.itemsize * math.prod(shape)
         if size > MAX_IMAGE_BYTES:
-            said, most = f"{path} claims {shape[1]} x {shape[0]} pixels", f"{MAX_IMAGE_BYTES} bytes"
+            said = f"{path} claims {shape[1]} x {shape[0]} pixels"
+            most = f"{MAX_IMAGE_BYTES} bytes"
             raise ds.DatasetFormatError.instead(said, size, most, path=str(path))
         wanted = np.uint16 if kind.kind == "u" else np.float32
         packing = tifffile.COMPRESSION
@@ -388,7 +399,10 @@ def tiff_bytes(image: npt.NDArray[np.uint16]) -> bytes:
     pixels = image.astype("<u2", copy=False).tobytes()
     at = 8 + len(pixels)
     software = b"flexdt\0\0"
-    short, long, rational, text = 3, 4, 5, 2
+    short = 3
+    long = 4
+    rational = 5
+    text = 2
     tags = (
         (256, long, 1, cols),
         (257, long, 1, rows),

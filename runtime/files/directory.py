@@ -99,7 +99,10 @@ class Directory:
         write: Write = write_some,
         above: Directory | None = None,
     ) -> None:
-        self.path, self._above, self._sync, self._write = path, above, sync, write
+        self.path = path
+        self._above = above
+        self._sync = sync
+        self._write = write
         self._fd: int | None = None
         self._closed = False
         self._busy = 0
@@ -127,7 +130,8 @@ class Directory:
         """
         assert self._above is not None
         with writing(self.path, f"cannot use folder {self.path}"):
-            self._fd, self._above = self._open_below(self._above), None
+            self._fd = self._open_below(self._above)
+            self._above = None
         return self
 
     def make(self) -> None:
@@ -415,7 +419,9 @@ class Directory:
         descriptor, too."""
         if name in ("", ".", "..") or "/" in name or "\0" in name:
             raise OSError(errno.EINVAL, "no name of an entry", name)
-        return name if _RELATIVE else str(self.path / name)
+        if _RELATIVE:
+            return name
+        return str(self.path / name)
 
     def _temporary(self, fd: int | None, mode: int, flags: int = 0) -> tuple[str, int]:
         """Make a file under an unused name; return the name and its descriptor."""

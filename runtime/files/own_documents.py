@@ -105,13 +105,15 @@ class Changes:
             keep: writes it instead, and may do so on a full disk; spaces may follow the
                 data then.
         """
-        before, old = self._before(), None
+        before = self._before()
+        old = None
         try:
             kept = before if _second_name(folder, name, before) else None
         except DiskFullError:
             if keep is None:
                 raise
-            kept, old = None, folder.read(name)
+            kept = None
+            old = folder.read(name)
         self._made.append(_Change(folder, name, data, kept, old, keep))
         (keep or folder.keep)(name, data)
 
@@ -164,8 +166,12 @@ class Changes:
             except FileNotFoundError:
                 continue
             except (OSError, DatasetWriteError) as error:
-                log("a change that was not made is still on the disk", logging.ERROR,
-                    file=str(change.folder.path / change.name), reason=str(error))  # fmt: skip
+                log(
+                    "a change that was not made is still on the disk",
+                    logging.ERROR,
+                    file=str(change.folder.path / change.name),
+                    reason=str(error),
+                )
         self.done()
 
 

@@ -471,4 +471,6 @@ def digest_of(body: Body) -> str:
 
 def _name(sample: Sample) -> str:
     """Return a sample's name, with its material if it has another one."""
-    return sample.name if sample.material is None else f"{sample.name} of {sample.material}"
+    if sample.material is None:
+        return sample.name
+    return f"{sample.name} of {sample.material}"

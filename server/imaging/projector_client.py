@@ -54,7 +54,8 @@ class ProjectorClient:
         self._evicts = False
         """Whether the server drops volumes when memory is needed."""
         self._channel: ProjectorLink | None = None
-        self._connecting, self._sending = asyncio.Lock(), asyncio.Lock()
+        self._connecting = asyncio.Lock()
+        self._sending = asyncio.Lock()
         self._closed = False
 
     @property
@@ -108,8 +109,10 @@ class ProjectorClient:
             ProjectorUnavailable: the server does not answer.
         """
         params: dict[str, object] = {
-            "volume": name, "cone_vec": image.encode(cone_vec.rows), "detector": list(shape),
-        }  # fmt: skip
+            "volume": name,
+            "cone_vec": image.encode(cone_vec.rows),
+            "detector": list(shape),
+        }
         whole = (len(cone_vec), *shape)
         for left in reversed(range(MAX_TRIES)):
             if body is not None:
@@ -161,7 +164,8 @@ class ProjectorClient:
         instance = answer.get("instance") if isinstance(answer, Mapping) else None
         self._evicts = isinstance(answer, Mapping) and answer.get("evicts") is True
         if instance != self._instance:
-            self._instance, self._sent = instance, {}
+            self._instance = instance
+            self._sent = {}
         return channel
 
 
@@ -173,11 +177,13 @@ async def _send(channel: ProjectorLink, name: str, value: Body, how: Mapping[str
     what: dict[str, object]
     if isinstance(value, TriangleMesh):
         what = {"mesh": {"vertices": len(value.vertices), "triangles": len(value.faces)}}
-        corners, faces = value.vertices.astype("<f8"), value.faces.astype("<i4")
+        corners = value.vertices.astype("<f8")
+        faces = value.faces.astype("<i4")
         flat = np.frombuffer(corners.tobytes() + faces.tobytes(), np.uint8)
     else:
         center = [float(c) for c in value.center_mm]
-        shape, voxel = list(value.shape), list(value.voxel_xyz)
+        shape = list(value.shape)
+        voxel = list(value.voxel_xyz)
         what = {"grid": {"shape": shape, "voxel_mm": voxel, "center_mm": center}}
         flat = np.ascontiguousarray(value.data, dtype="<f4").reshape(-1).view(np.uint8)
     for start in range(0, flat.size, CHUNK_BYTES):

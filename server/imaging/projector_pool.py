@@ -134,8 +134,10 @@ class ProjectorPool:
             ProjectorUnavailable: none has answered within the patience.
             RpcError: an error that another projector would answer, too.
         """
-        loop, value = asyncio.get_running_loop(), self._values.get(name)
-        deadline, late = loop.time() + self.patience_s, 0.0
+        loop = asyncio.get_running_loop()
+        value = self._values.get(name)
+        deadline = loop.time() + self.patience_s
+        late = 0.0
         running: dict[asyncio.Future[Any], _Member] = {}
         asked: set[_Member] = set()
         refused: set[_Member] = set()
@@ -230,7 +232,8 @@ class ProjectorPool:
             images = await member.client.project(name, value, views, shape)
         except (ProjectorUnavailable, RpcError) as error:
             if isinstance(error, ProjectorUnavailable) or len(self) > 1:
-                member.rests_until, member.kind = loop.time() + REST_S, None
+                member.rests_until = loop.time() + REST_S
+                member.kind = None
                 self._lines.log("a projector gave no answer", logging.WARNING, reason=str(error))
             raise
         taken = (loop.time() - begun) / len(views)

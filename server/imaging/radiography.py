@@ -73,7 +73,8 @@ def with_spectra(machine: Machine, physics: Physics) -> Machine:
     if physics == "ideal":
         return machine
     tube, (least, most) = machine.tube, voltages()
-    low, high = max(least, tube.min_kV), min(most, tube.max_kV)
+    low = max(least, tube.min_kV)
+    high = min(most, tube.max_kV)
     if not low <= tube.kV <= high:
         said = f"physics {physics} has no spectrum for the tube's {tube.kV:g} kV"
         raise LimitError.instead(said, tube.kV, f"{low:g} to {high:g} kV")
@@ -118,7 +119,8 @@ class Radiography:
                 f"scatter {scatter} needs physics mono or poly, not ideal",
                 {"asked": scatter, "allowed": ["off"]},
             )
-        panel, tube = detector_of(machine.detector), tube_of(machine.tube)
+        panel = detector_of(machine.detector)
+        tube = tube_of(machine.tube)
         return cls(imaging, ideal.ideal_response(machine), physics, panel, tube, scatter)
 
     @property
@@ -178,7 +180,8 @@ class Radiography:
             if len(lines) == count:
                 return [Radiograph(one) for one in lines]
             return [Radiograph(part) for part in lines.reshape(count, -1, *lines.shape[1:])]
-        points, moments = self.tube.spot_points, len(poses) // count
+        points = self.tube.spot_points
+        moments = len(poses) // count
         if points > 1 and count > 1:  # one by one: each holds the paths of all its points
             parts = [slice(i * moments, (i + 1) * moments) for i in range(count)]
             return [
@@ -192,7 +195,8 @@ class Radiography:
         mono_keV = stated_keV() if self.physics == "mono" else None
         chain = chain_through(channels, self.panel, self.tube, mono_keV)
         if points > 1:
-            chain, moments = without_spot(chain), moments * points
+            chain = without_spot(chain)
+            moments = moments * points
         added: list[Scattered] = []
         if self.scatter != "off" and channels:
             thing = await self.imaging.scatterer(sample, SCATTER.voxels)
@@ -258,12 +262,16 @@ class Radiography:
     @property
     def full_scale(self) -> int:
         """Largest count."""
-        return self.model.full_scale if self.physics == "ideal" else self.panel.full_scale
+        if self.physics == "ideal":
+            return self.model.full_scale
+        return self.panel.full_scale
 
     @property
     def offset(self) -> float:
         """Count without signal."""
-        return self.model.dark_counts if self.physics == "ideal" else self.panel.offset_counts
+        if self.physics == "ideal":
+            return self.model.dark_counts
+        return self.panel.offset_counts
 
     @property
     def saturating(self) -> float:

@@ -24,7 +24,9 @@ class TokenCheck:
     """
 
     def __init__(self, token: str | None, close: Callable[[], object], lines: Sparing) -> None:
-        self._token, self._close, self._lines = token, close, lines
+        self._token = token
+        self._close = close
+        self._lines = lines
         self._wrong = 0
 
     async def check(self, given: str | None, client: str) -> None:

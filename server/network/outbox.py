@@ -158,7 +158,9 @@ def _not_finite(value: object, path: str = "$") -> str | None:
     """Find the path of the first number that JSON cannot represent, for the log."""
     match value:
         case float():
-            return None if math.isfinite(value) else f"{path}: {value}"
+            if math.isfinite(value):
+                return None
+            return f"{path}: {value}"
         case BaseModel():
             return _not_finite(value.model_dump(), path)
         case Mapping():

@@ -49,8 +49,15 @@ async def answered(
     code = answer.error.code if isinstance(answer, m.Failure) else None
     observe(method if method in known else "unknown", taken, code)
     if LOGGER.isEnabledFor(logging.DEBUG):
-        log("request", logging.DEBUG, trace=trace, client=client, method=method[:100],
-            ms=round(1000 * taken, 3), code=code)  # fmt: skip
+        log(
+            "request",
+            logging.DEBUG,
+            trace=trace,
+            client=client,
+            method=method[:100],
+            ms=round(1000 * taken, 3),
+            code=code,
+        )
     return answer
 
 
@@ -74,7 +81,9 @@ class Call:
     @property
     def message(self) -> m.Request | m.Notification:
         """The message without parameters, as it concerns the order of requests and answers."""
-        return m.Request(self.id, self.method) if self.answered else m.Notification(self.method)
+        if self.answered:
+            return m.Request(self.id, self.method)
+        return m.Notification(self.method)
 
 
 @dataclass(frozen=True)

@@ -77,10 +77,8 @@ class TcpServer(ListeningServer):
 
     def __post_init__(self) -> None:
         self.links: set[_Link] = set()
-        self.waiting, self.reserved = (
-            Room[_Link](waiting_room.WAITING),
-            Room[_Link](RESERVED_PLACES),
-        )
+        self.waiting = Room[_Link](waiting_room.WAITING)
+        self.reserved = Room[_Link](RESERVED_PLACES)
         self.lines = Sparing()
         self.turns = loop_turns.LoopTurns()
         self.urgent = tuple(x.name.encode() for x in self.methods.values() if x.urgent)
@@ -168,7 +166,8 @@ class _Link(asyncio.BufferedProtocol):
     """One connection."""
 
     def __init__(self, server: TcpServer) -> None:
-        self.server, self.limits = server, server.limits
+        self.server = server
+        self.limits = server.limits
         self.wire = Connection(max_message=self.limits.max_message, max_batch=self.limits.max_batch)
         self.name = self.address = ""
         self.number = self.served = 0
@@ -275,7 +274,8 @@ class _Link(asyncio.BufferedProtocol):
             if len(raw) > MAX_INLINE_BYTES:
                 return False  # it costs more than a look; it is urgent in its turn
             message = self.wire.decode(raw)
-            lane, served = self._lane(message), len(self.tasks) + len(found)
+            lane = self._lane(message)
+            served = len(self.tasks) + len(found)
             if lane == loop_turns.ORDINARY or served >= MAX_URGENT_IN_SERVICE * (
                 4 if lane == loop_turns.FIRST else 1
             ):
@@ -315,7 +315,8 @@ class _Link(asyncio.BufferedProtocol):
         self.server.waiting.leave(self)
         self.server.reserved.leave(self)
         if self.session is not None:
-            session, self.session = self.session, None
+            session = self.session
+            self.session = None
             try:
                 session.close()
             except Exception:
@@ -401,7 +402,9 @@ class _Link(asyncio.BufferedProtocol):
         known = self.server.methods.get(name)
         if not self.let_in or known is None or not known.urgent:
             return loop_turns.ORDINARY
-        return loop_turns.FIRST if name == ESTOP else loop_turns.URGENT
+        if name == ESTOP:
+            return loop_turns.FIRST
+        return loop_turns.URGENT
 
     def _urgent(self, message: m.Message | parts.Frozen) -> bool:
         """Return whether a message is not ordinary."""
@@ -557,9 +560,13 @@ class _Link(asyncio.BufferedProtocol):
         self.served += 1
         trace = f"{self.number}.{self.served}"
         return await parts.answered(
-            self._try(id, name, given, trace), name, trace=trace, client=self.name,
-            known=self.server.methods, observe=self.server.observe,
-        )  # fmt: skip
+            self._try(id, name, given, trace),
+            name,
+            trace=trace,
+            client=self.name,
+            known=self.server.methods,
+            observe=self.server.observe,
+        )
 
     async def _try(self, id: m.Id, name: str, given: Given, trace: str) -> m.Response | m.Failure:
         """Check token, rate, place and parameters of a call, and have the session handle it."""

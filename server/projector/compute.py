@@ -196,4 +196,6 @@ def _compile_back() -> None:
 def backend() -> str:
     """Name what computes: "numba" on the processor, or the CUDA device before it."""
     found = gpu.availability()
-    return f"{found.reason} (CUDA), numba" if found.present else "numba"
+    if found.present:
+        return f"{found.reason} (CUDA), numba"
+    return "numba"

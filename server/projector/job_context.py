@@ -40,7 +40,8 @@ class JobClient:
     """One connection, its jobs and its requests under way."""
 
     def __init__(self, link: FrameLink, token: str | None, lines: Sparing) -> None:
-        self.link, self.let_in = link, token is None
+        self.link = link
+        self.let_in = token is None
         self.lanes = Lane(), Lane()
         self.jobs: dict[Id, ComputeJob] = {}
         self.calls: Correlation[None] = Correlation(Role.SERVER)

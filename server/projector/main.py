@@ -41,10 +41,16 @@ async def run(options: ProjectorSettings) -> int:
     )
     async with served_pages(projector_pages(server, requests), options) as pages:
         stop = stop_signal()
-        announce("projector", {
-            "host": options.host, "port": server.port, "threads": threads, "memory_limit": limit,
-            **pages,
-        })  # fmt: skip
+        announce(
+            "projector",
+            {
+                "host": options.host,
+                "port": server.port,
+                "threads": threads,
+                "memory_limit": limit,
+                **pages,
+            },
+        )
         await stop.wait()
     await server.close()
     return OK

@@ -44,9 +44,12 @@ async def hello(context: Context, client: JobClient, id: Id, p: Hello) -> object
     client.let_in = True
     client.link.deadlines.stop("hello")
     return {
-        "protocol": PROTOCOL, "server": f"flexdt projector {version('flexdt')}",
-        "machine": "", "instance": context.instance, "evicts": True,
-    }  # fmt: skip
+        "protocol": PROTOCOL,
+        "server": f"flexdt projector {version('flexdt')}",
+        "machine": "",
+        "instance": context.instance,
+        "evicts": True,
+    }
 
 
 async def volume_put(context: Context, client: JobClient, id: Id, p: wire.VolumePut) -> object:
@@ -104,7 +107,9 @@ async def project(context: Context, client: JobClient, id: Id, p: wire.Project) 
     block = views_a_block(p.detector)
     if p.key is not None:
         context.supersede(client, p.key)
-    job, parts, done = client.begin(id, p.key), 0, 0
+    job = client.begin(id, p.key)
+    parts = 0
+    done = 0
     for step in projection_steps(volume, rows, p.detector, block):
         views = await job.run(context.compute, step)
         assert isinstance(views, np.ndarray)

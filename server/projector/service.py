@@ -146,7 +146,8 @@ class ProjectorServer(ListeningServer):
     async def _serve(self, client: JobClient, body: memoryview) -> None:
         """Decode a frame, answer its request and release the client's lane."""
         request: m.Id = None
-        link, calls = client.link, client.calls
+        link = client.link
+        calls = client.calls
         try:
             match message := frames.unpack(body):
                 case m.Batch():
@@ -184,9 +185,13 @@ class ProjectorServer(ListeningServer):
     ) -> m.Response | m.Failure:
         """Serve a call, and count and log it."""
         return await answered(
-            self._try(client, id, name, given), name, trace=str(id), client=client.link.peer,
-            known=PROJECTOR_METHODS, observe=self.observe,
-        )  # fmt: skip
+            self._try(client, id, name, given),
+            name,
+            trace=str(id),
+            client=client.link.peer,
+            known=PROJECTOR_METHODS,
+            observe=self.observe,
+        )
 
     async def _try(
         self, client: JobClient, id: m.Id, name: str, given: Given

@@ -112,7 +112,9 @@ class FrameLink(asyncio.BufferedProtocol):
             if self._filled == 4:
                 self._begin(struct.unpack(">I", self._head)[0])
         elif self._filled == len(self._body):
-            body, self._body, self._filled = self._body, None, 0
+            body = self._body
+            self._body = None
+            self._filled = 0
             self.deadlines.stop("frame")
             self.on_frame(self, body)
 
@@ -222,7 +224,8 @@ class _Pending:
 
     def part(self, params: Mapping[str, object]) -> None:
         """Copy a part into the array of the result."""
-        start, data = params.get("start"), params.get("data")
+        start = params.get("start")
+        data = params.get("data")
         if self.shape is None or not isinstance(start, int):
             return
         if self.parts is None:

@@ -57,7 +57,8 @@ class Corrections:
     def __init__(
         self, folder: Directory, in_force: Sequence[str | None] = (), most: int = 10_000
     ) -> None:
-        self._folder, self._most = folder, most
+        self._folder = folder
+        self._most = most
         self._all: dict[str, NamedCorrection] = {}
         self._sources: dict[str, str | None] = {}
         self._files: dict[str, str] = {}
@@ -237,7 +238,9 @@ def _joined(before: History, in_force: History) -> History:
         return in_force
     [name] = in_force
     there = [i for i, known in enumerate(before) if known == name]
-    return before[: there[-1] + 1] if there else [*before, name]
+    if there:
+        return before[: there[-1] + 1]
+    return [*before, name]
 
 
 def _read_history(data: bytes) -> History:

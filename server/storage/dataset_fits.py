@@ -47,10 +47,14 @@ def fit(root: Directory, asked: p.CalibrationFit, *_: object) -> p.CalibrationFi
     if asked.markers is not None:
         marks = [(m.frame, m.marker, m.column, m.row, m.sigma) for m in asked.markers]
     found = calibrate(
-        [_there(root, name) for name in asked.datasets], phantom,
-        free=asked.free, priors=asked.priors, per_frame=asked.per_frame,
-        markers=marks, scale=asked.scale,
-    )  # fmt: skip
+        [_there(root, name) for name in asked.datasets],
+        phantom,
+        free=asked.free,
+        priors=asked.priors,
+        per_frame=asked.per_frame,
+        markers=marks,
+        scale=asked.scale,
+    )
     told = dict(found.document)
     fitted = found.calibration.fit
     if fitted is not None:

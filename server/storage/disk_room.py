@@ -77,7 +77,8 @@ class UsedBytes:
 
 def _read(folder: Directory, changed_ns: int) -> _Seen:
     """Read a folder's files and folders."""
-    nbytes, folders = 0, list[str]()
+    nbytes = 0
+    folders = list[str]()
     with folder.entries() as entries:
         for entry in entries:
             with suppress(OSError):
@@ -116,7 +117,8 @@ class DiskRoom:
         Raises:
             DiskFullError: says what is needed and what is free.
         """
-        need, free = size + RESERVE_BYTES - there, free_bytes(self.root.path)
+        need = size + RESERVE_BYTES - there
+        free = free_bytes(self.root.path)
         if self.quota is not None:
             with self._lock:
                 left = max(0, self.quota - self._used.count())
@@ -140,7 +142,8 @@ def require_last(folder: Path, what: str, size: int) -> None:
     Raises:
         DiskFullError: as if the disk was full.
     """
-    free, need = free_bytes(folder), size + LAST_BYTES
+    free = free_bytes(folder)
+    need = size + LAST_BYTES
     if free is not None and free < need:
         raise DiskFullError(
             f"no room for {what}: {size} bytes asked, {free} bytes free, of which {LAST_BYTES} are "

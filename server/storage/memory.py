@@ -147,12 +147,17 @@ def restore(memory: Memory, scanner: ScannerTwin, now: float) -> Sample | None:
         more, so that only the E-stop is restored.
     """
     known: p.Scene | None
-    known, spec = memory.scene, scanner.machine.tube
+    known = memory.scene
+    spec = scanner.machine.tube
     # Which correction is in force the history says.
     known = known.model_copy(update={"correction": None})
     if not spec.min_kV <= known.tube.kV <= spec.max_kV:  # the physics may be another one
-        log("the tube starts anew: its last voltage is outside what it has now", logging.WARNING,
-            kV=known.tube.kV, allowed=[spec.min_kV, spec.max_kV])  # fmt: skip
+        log(
+            "the tube starts anew: its last voltage is outside what it has now",
+            logging.WARNING,
+            kV=known.tube.kV,
+            allowed=[spec.min_kV, spec.max_kV],
+        )
         tube = known.tube.model_copy(update={"kV": scanner.tube.kV})
         known = known.model_copy(update={"tube": tube})
     try:
@@ -160,8 +165,11 @@ def restore(memory: Memory, scanner: ScannerTwin, now: float) -> Sample | None:
         scanner.place(_within(scanner.machine, known.positions), now)
         apply_settings(known, scanner)
     except (TwinError, RpcError) as error:
-        log("the last state does not fit this machine; starting anew", logging.WARNING,
-            reason=str(error))  # fmt: skip
+        log(
+            "the last state does not fit this machine; starting anew",
+            logging.WARNING,
+            reason=str(error),
+        )
         known = None
     if memory.estop:  # stays in force, whatever else is begun anew
         scanner.estop(now)
@@ -190,15 +198,18 @@ class StateStore:
         job_files: JobFiles,
         changed_jobs: Callable[[], ChangedJobs],
     ) -> None:
-        self._root, self._make = root, make
-        self._job_files, self._changed_jobs = job_files, changed_jobs
+        self._root = root
+        self._make = make
+        self._job_files = job_files
+        self._changed_jobs = changed_jobs
         self._unwritten: ChangedJobs = {}
         self._spares = SpareFiles(root)
         self.problem: str | None = None
         """Why the last change that did not wait for the disk is not on it, or None."""
         self.noticed: Callable[[str | None], None] = lambda problem: None
         """Called when there is a problem, and with None when it is over."""
-        self._changed, self._at_once = asyncio.Event(), asyncio.Event()
+        self._changed = asyncio.Event()
+        self._at_once = asyncio.Event()
         self._writing = asyncio.Lock()
         self._file = threading.Lock()
         self._ended = False
@@ -291,7 +302,8 @@ class StateStore:
 
     def _note(self, problem: str | None) -> None:
         """Report a problem with the disk when it begins or ends."""
-        before, self.problem = self.problem, problem
+        before = self.problem
+        self.problem = problem
         if (before is None) != (problem is None):
             self.noticed(problem)
 

@@ -129,7 +129,8 @@ class _LruCache:
     """Cache of the last `most` results by key."""
 
     def __init__(self, most: int) -> None:
-        self._most, self._made = most, dict[Hashable, Any]()
+        self._most = most
+        self._made = dict[Hashable, Any]()
 
     def __contains__(self, key: Hashable) -> bool:
         return key in self._made
@@ -193,7 +194,9 @@ class _Scan:
     def beam(self) -> tuple[float | None, float | None]:
         """kV and W of the projections."""
         said = self.document.tube if self.document else self.texts and self.texts.settings
-        return (said.kV, said.power_W) if said else (None, None)
+        if said:
+            return (said.kV, said.power_W)
+        return (None, None)
 
 
 def _place(root: Directory, name: str) -> tuple[Path, tuple[object, ...]]:
@@ -217,7 +220,8 @@ def _scan(folder: files.Folder, most: int) -> _Scan:
     except ds.DatasetError as error:
         if not folder.projections:
             raise
-        texts, problem = _texts(folder), error.message
+        texts = _texts(folder)
+        problem = error.message
     bare = [_UndocumentedFrame(f, "dark", xrays_on=False) for f in folder.darks]
     bare += [_UndocumentedFrame(f, "flat") for f in folder.flats]
     if texts is None:
@@ -231,11 +235,14 @@ def _scan(folder: files.Folder, most: int) -> _Scan:
         shown["roi"] = s.roi.edges
     bare += [
         _UndocumentedFrame(
-            frame.file, "projection", **shown, cone_vec=row,
+            frame.file,
+            "projection",
+            **shown,
+            cone_vec=row,
             positions={name: float(at[frame.index]) for name, at in texts.positions.items()},
         )
         for frame, row in zip(texts.frames, texts.cone_vec.rows.tolist(), strict=True)
-    ]  # fmt: skip
+    ]
     return _Scan(folder, tuple(bare), None, texts, f"there is no {DOCUMENT}: its texts are read")
 
 
@@ -264,28 +271,40 @@ def _kept_scan(path: Path, key: tuple[object, ...]) -> _Scan:
 
 def _info(path: Path, modified: float, scan: _Scan) -> p.DatasetInfo:
     """Summarise a data set."""
-    folder, document = scan.folder, scan.document
+    folder = scan.folder
+    document = scan.document
     kV, power_W = scan.beam
     if document is None:
-        there, texts = len(folder.projections), scan.texts
+        there = len(folder.projections)
+        texts = scan.texts
         told = {}
         if texts is not None and (said := texts.settings) is not None:
             told = {
-                "state": "complete" if texts.complete else "incomplete", "reason": texts.reason,
+                "state": "complete" if texts.complete else "incomplete",
+                "reason": texts.reason,
                 "started": said.started and said.started.isoformat(),
-                "sample": said.sample_name or "", "operator": said.operator or "",
-                "machine": said.scanner_name, "mode": said.mode, "shape": texts.shape,
-                "exposure_ms": said.exposure_ms, "projections": len(texts), "kV": kV,
+                "sample": said.sample_name or "",
+                "operator": said.operator or "",
+                "machine": said.scanner_name,
+                "mode": said.mode,
+                "shape": texts.shape,
+                "exposure_ms": said.exposure_ms,
+                "projections": len(texts),
+                "kV": kV,
                 "power_W": power_W,
-            }  # fmt: skip
+            }
         info = p.DatasetInfo(
-            name=path.name, modified=modified, projections=there, present=there,
+            name=path.name,
+            modified=modified,
+            projections=there,
+            present=there,
             problem=scan.problem[:500],
-        )  # fmt: skip
+        )
         return info.model_copy(update=told)
     lost = folder.lost([f.file for f in document.frames])
     taken = document.files("projection")
-    detector, named = document.detector, document.machine.get("name")
+    detector = document.detector
+    named = document.machine.get("name")
     return p.DatasetInfo(
         name=path.name,
         modified=modified,
@@ -313,7 +332,8 @@ def _list(
     root: Directory, asked: p.DatasetList, around: TwinContext, codec: Codec
 ) -> p.DatasetListResult:
     """Answer dataset.list: the data sets that match the search, within the time limit."""
-    folders, left_out = [], 0
+    folders = []
+    left_out = 0
     with root.entries() as entries:
         for entry in entries:
             try:
@@ -326,8 +346,10 @@ def _list(
                 continue
     folders.sort(reverse=True)
     left_out += len(folders[MAX_SETS:])
-    words, until = asked.search.lower().split(), time.monotonic() + LIST_S
-    found, unread = [], 0
+    words = asked.search.lower().split()
+    until = time.monotonic() + LIST_S
+    found = []
+    unread = 0
     for modified, name in folders[:MAX_SETS]:
         try:
             path, key = _place(root, name)
@@ -341,9 +363,15 @@ def _list(
             continue
         info = _as_it_runs(info, around)
         said = (
-            info.name, info.state, info.sample, info.operator, info.machine, info.mode,
-            info.started, f"{info.kV or 0:g}kV {info.exposure_ms or 0:g}ms {info.power_W or 0:g}W",
-        )  # fmt: skip
+            info.name,
+            info.state,
+            info.sample,
+            info.operator,
+            info.machine,
+            info.mode,
+            info.started,
+            f"{info.kV or 0:g}kV {info.exposure_ms or 0:g}ms {info.power_W or 0:g}W",
+        )
         if all(any(word in str(text).lower() for text in said) for word in words):
             unread += late
             found.append(info)
@@ -356,7 +384,9 @@ def _list(
 def _as_it_runs(info: p.DatasetInfo, around: TwinContext) -> p.DatasetInfo:
     """Set the state of a data set that is being written."""
     running = info.name == around.running
-    return info.model_copy(update={"state": "running", "reason": ""}) if running else info
+    if running:
+        return info.model_copy(update={"state": "running", "reason": ""})
+    return info
 
 
 def _listed(path: Path, modified: float) -> p.DatasetInfo | str:
@@ -410,7 +440,8 @@ def _get(
 ) -> p.DatasetResult:
     """Answer dataset.get: settings, poses over time, and what else is requested."""
     scan = _opened(root, asked.name)
-    folder, images = scan.folder, scan.images
+    folder = scan.folder
+    images = scan.images
     about = root.stat(asked.name)
     info = _info(folder.path, 0.0 if about is None else about.st_mtime, scan)
     info = _as_it_runs(info, around)
@@ -436,7 +467,8 @@ def _get(
 
 def _same(scan: _Scan, around: TwinContext) -> bool:
     """Return whether the twin has the machine and the profile of a data set."""
-    said, texts = scan.document, scan.texts
+    said = scan.document
+    texts = scan.texts
     machine, profile = (said.machine, said.profile) if said else ({}, None)
     if texts is not None and texts.profile is not None and texts.positions:
         machine = texts.machine.model_dump(mode="json", by_alias=True)
@@ -471,7 +503,8 @@ def _measured(scan: _Scan, at: tuple[int, ...]) -> dict[str, Any]:
     try:
         near, what = _clearances(scan, at)
     except (TwinError, ValueError, KeyError) as error:
-        near, what = None, f"not known: {error}"[:300]
+        near = None
+        what = f"not known: {error}"[:300]
     return {"counts": counts, "clearance_mm": near, "clearance_of": what}
 
 
@@ -490,7 +523,8 @@ def _clearances(scan: _Scan, at: tuple[int, ...]) -> tuple[list[float | None], s
 
     document = scan.document
     assert document is not None
-    machine, sample = document.machine_of(), document.sample
+    machine = document.machine_of()
+    sample = document.sample
     pieces: tuple[UprightCylinder, ...] = ()
     what = "the machine without a sample, whose size is not known"
     if sample.diameter_mm > 0 and sample.height_mm > 0:
@@ -512,7 +546,9 @@ def _frame(
 ) -> p.DatasetFrameResult:
     """Answer dataset.frame: one image, normalised and binned as requested."""
     scan = _opened(root, asked.name)
-    folder, document, images = scan.folder, scan.document, scan.images
+    folder = scan.folder
+    document = scan.document
+    images = scan.images
     if asked.index >= len(images):
         raise LimitError(
             f"{asked.name} has {len(images)} images; there is no image {asked.index}",
@@ -550,10 +586,12 @@ def _frame(
         cone_vec=frame.cone_vec,
         tube={"kV": kV, "power_W": power_W, "on": frame.xrays_on},
         camera={
-            "exposure_ms": frame.exposure_ms, "mode": frame.mode, "averages": frame.averages,
+            "exposure_ms": frame.exposure_ms,
+            "mode": frame.mode,
+            "averages": frame.averages,
             "roi": list(frame.roi) if frame.roi else None,
         },
-    )  # fmt: skip
+    )
 
 
 def _there(folder: files.Folder, file: str) -> str:

@@ -67,7 +67,9 @@ class Incoming:
     """
 
     def __init__(self, folder: Directory, limit: int, room: DiskRoom | None = None) -> None:
-        self._folder, self._limit, self._disk = folder, limit, room
+        self._folder = folder
+        self._limit = limit
+        self._disk = room
         self._open: dict[str, _Open] = {}
         self._lock = threading.Lock()
 
@@ -144,8 +146,12 @@ class Incoming:
     def _drop(self, but: str | None = None) -> None:
         """Drop the oldest upload but one, and log it."""
         oldest = next(name for name in self._open if name != but)
-        log("an unfinished upload was dropped for newer ones", logging.WARNING, name=oldest,
-            received=self._open[oldest].received)  # fmt: skip
+        log(
+            "an unfinished upload was dropped for newer ones",
+            logging.WARNING,
+            name=oldest,
+            received=self._open[oldest].received,
+        )
         self._close(oldest)
 
     def _close(self, name: str) -> None:

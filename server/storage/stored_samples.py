@@ -63,7 +63,9 @@ class ReceivedSample:
     @property
     def standing(self) -> Phantom:
         """The phantom as it will be on the stage."""
-        return self.phantom if self.worn is None else self.worn[1]
+        if self.worn is None:
+            return self.phantom
+        return self.worn[1]
 
 
 class SampleStore:
@@ -86,7 +88,9 @@ class SampleStore:
         memory_limit: int | None = None,
     ) -> None:
         self._memory_limit = math.inf if memory_limit is None else memory_limit
-        self._folder, self._limit, self._most = folder, limit, most
+        self._folder = folder
+        self._limit = limit
+        self._most = most
         self._incoming: Incoming = Incoming(folder, 2 * limit, room)
         self._heads: dict[str, UploadHead] = {}
         """Their revisions are what their files say; those of older servers say nothing."""
@@ -126,8 +130,11 @@ class SampleStore:
         """Return an identifier of what an upload that has been read shows; None for a
         shipped phantom."""
         with self._lock:
-            revision, head = self._revisions.get(name), self._heads.get(name)
-        return None if revision is None or head is None else _shown(head, revision)
+            revision = self._revisions.get(name)
+            head = self._heads.get(name)
+        if revision is None or head is None:
+            return None
+        return _shown(head, revision)
 
     def load(self, name: str, material: str | None = None) -> Phantom:
         """Load the phantom called `name`; parsed once and cached.
@@ -143,7 +150,8 @@ class SampleStore:
         """
         key = (name, material)
         with self._lock:
-            head, phantom = self._heads.get(name), self._loaded.pop(key, None)
+            head = self._heads.get(name)
+            phantom = self._loaded.pop(key, None)
             if phantom is not None:
                 self._loaded[key] = phantom  # the newest again: what is used stays
                 return phantom
@@ -210,7 +218,8 @@ class SampleStore:
         Raises:
             DatasetWriteError: the system cannot write.
         """
-        head, stem = upload.head, own.file_stem(upload.head.name)
+        head = upload.head
+        stem = own.file_stem(upload.head.name)
         changes.put(self._folder, _bytes_file(head.name, upload.revision), upload.raw)
         document = head.model_dump(by_alias=True, exclude={"start", "data"})
         document["revision"] = upload.revision
@@ -254,7 +263,8 @@ class SampleStore:
     def tidy(self) -> None:
         """Delete the bytes that an upload or `forget` has replaced."""
         with self._lock:
-            files, self._replaced = self._replaced, set()
+            files = self._replaced
+            self._replaced = set()
         for file in files:
             with suppress(OSError):
                 self._folder.unlink(file)
@@ -327,7 +337,9 @@ def _revision(head: UploadHead, raw: bytes) -> str:
 def _shown(head: UploadHead, revision: str) -> str:
     """Return an identifier of what an upload shows: the same content may come in another
     material."""
-    return revision if head.material is None else f"{revision} {head.material}"
+    if head.material is None:
+        return revision
+    return f"{revision} {head.material}"
 
 
 def _parse(head: UploadHead, raw: bytes, material: str | None) -> Phantom:
@@ -362,11 +374,9 @@ def _parse(head: UploadHead, raw: bytes, material: str | None) -> Phantom:
 
 def _bytes_file(name: str, revision: str | None) -> str:
     """Return the file name of an upload's bytes; earlier servers had one file for each name."""
-    return (
-        f"{own.file_stem(name)}.bin"
-        if revision is None
-        else f"{own.file_stem(name)}.{revision}.bin"
-    )
+    if revision is None:
+        return f"{own.file_stem(name)}.bin"
+    return f"{own.file_stem(name)}.{revision}.bin"
 
 
 def _head_of(file: str) -> Callable[[bytes], UploadHead]:
@@ -388,4 +398,6 @@ def sample_material(head: UploadHead | None, material: str | None) -> str | None
     if head is None or head.kind != "mesh":
         return None
     chosen = head.material if material is None else material
-    return DEFAULT_MATERIAL if chosen is None else chosen
+    if chosen is None:
+        return DEFAULT_MATERIAL
+    return chosen

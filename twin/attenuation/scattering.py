@@ -74,7 +74,8 @@ def cross_sections(substances: tuple[Substance, ...]) -> CrossSections:
         >>> round(float(water.incoherent[0, at]), 4)  # XCOM: 0.0177 1/mm
         0.0177
     """
-    energy, stored = tables().energy_keV, _scattering()
+    energy = tables().energy_keV
+    stored = _scattering()
     # Of an atom by atomic number from 1, (92, q), at (q,) values of x whose root grows evenly.
     x, form_factor, function = (stored[name] for name in ("x", "form_factor", "incoherent"))
     form, shell = np.zeros((2, len(substances), len(x)))
@@ -88,8 +89,10 @@ def cross_sections(substances: tuple[Substance, ...]) -> CrossSections:
     cumulated = np.concatenate([np.zeros((len(form), 1)), np.cumsum(rings, axis=1)], axis=1)
     # Integrals over the sphere, in w = sin(theta / 2)^(1/2): the forward peak is broad there.
     points, weights = np.polynomial.legendre.leggauss(160)
-    w, dw = (points + 1.0) / 2.0, weights / 2.0
-    cosine, ring = 1.0 - 2.0 * w**4, 2.0 * np.pi * 8.0 * w**3 * dw
+    w = (points + 1.0) / 2.0
+    dw = weights / 2.0
+    cosine = 1.0 - 2.0 * w**4
+    ring = 2.0 * np.pi * 8.0 * w**3 * dw
     root_step = float(np.sqrt(x[1]))
     column = np.sqrt(energy[:, None] / HC_KEV_A) * w / root_step
     index = np.arange(len(x))

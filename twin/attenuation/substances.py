@@ -190,7 +190,9 @@ class Substance:
 def _mass_at(row: int, energy_keV: float) -> float:
     """Interpolate mu/rho of an element [cm2/g], log-log from the two nearest bins with no
     edge between."""
-    bins, edges, total = tables().energy_keV, tables().edges_keV[row], tables().total[row]
+    bins = tables().energy_keV
+    edges = tables().edges_keV[row]
+    total = tables().total[row]
     alike = np.searchsorted(edges, bins, "right") == np.searchsorted(edges, energy_keV, "right")
     away = np.abs(bins - energy_keV)
     near, far = np.argsort(np.where(alike, away, np.inf) if alike.any() else away)[:2]
@@ -213,7 +215,8 @@ def parse_formula(formula: str) -> dict[str, float]:
         match = _TOKEN.match(formula, at)
         if match is None or (match[1] == "(" and match[2]):
             raise _unreadable(formula, at)
-        symbol, count = match[1], 1.0 if match[2] is None else float(match[2])
+        symbol = match[1]
+        count = 1.0 if match[2] is None else float(match[2])
         if symbol == "(":
             levels.append({})
         elif symbol == ")":

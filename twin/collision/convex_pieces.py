@@ -83,7 +83,8 @@ class _Piece:
     """Triangles whose hull holds a part of the solid."""
 
     def __init__(self, triangles: FloatArray) -> None:
-        self.triangles, self.hull = triangles, hull(triangles.reshape(-1, 3))
+        self.triangles = triangles
+        self.hull = hull(triangles.reshape(-1, 3))
         corners = self.hull.vertices[self.hull.faces]
         self.volume = float(np.linalg.det(corners).sum()) / 6.0
 
@@ -91,9 +92,11 @@ class _Piece:
 def _best_cut(piece: _Piece) -> Sequence[_Piece] | None:
     """Find the halves of the best of a few cuts; None if none is worthwhile."""
     points = piece.hull.vertices
-    best, wanted = None, MAX_VOLUME_SHARE * piece.volume
+    best = None
+    wanted = MAX_VOLUME_SHARE * piece.volume
     for axis in range(3):
-        low, high = points[:, axis].min(), points[:, axis].max()
+        low = points[:, axis].min()
+        high = points[:, axis].max()
         for share in (0.25, 0.5, 0.75):
             at = low + share * (high - low)
             halves = [_clip(piece.triangles, axis, at, side) for side in (-1.0, 1.0)]
@@ -102,7 +105,8 @@ def _best_cut(piece: _Piece) -> Sequence[_Piece] | None:
             made = [_Piece(h) for h in halves]
             volume = sum(m.volume for m in made)
             if volume < wanted:
-                best, wanted = made, volume
+                best = made
+                wanted = volume
     return best
 
 
@@ -117,11 +121,15 @@ def _clip(triangles: FloatArray, axis: int, at: float, side: float) -> FloatArra
     """
     height = side * (triangles[:, :, axis] - at)
     count = (height >= 0.0).sum(axis=1)
-    one, two = count == 1, count == 2
+    one = count == 1
+    two = count == 2
     # The corner that is alone on its side comes first.
-    alone = np.concatenate([_led_by(triangles[one], height[one], 1.0),
-                            _led_by(triangles[two], height[two], -1.0)])  # fmt: skip
-    lead, left, right = alone[:, 0], alone[:, 1], alone[:, 2]
+    alone = np.concatenate(
+        [_led_by(triangles[one], height[one], 1.0), _led_by(triangles[two], height[two], -1.0)]
+    )
+    lead = alone[:, 0]
+    left = alone[:, 1]
+    right = alone[:, 2]
     to_left, to_right = (_crossing(lead, end, axis, at) for end in (left, right))
     inner = np.arange(len(alone)) < one.sum()
     tips = np.stack([lead, to_left, to_right], axis=1)[inner]

@@ -74,7 +74,8 @@ class PathSearch:
     def _nearest_first(self) -> tuple[list[Pair], list[float]]:
         """Pairs that move relative to each other, and bounds of their clearances,
         ascending [mm]."""
-        lower, upper = self.path.q.min(axis=0), self.path.q.max(axis=0)
+        lower = self.path.q.min(axis=0)
+        upper = self.path.q.max(axis=0)
         stack = self.scene.candidates(lower, upper)
         bounds = stack.clearances(lower, upper)
         moving = np.asarray((stack.moves & self.path.moving).any(axis=1))
@@ -106,7 +107,9 @@ class PathSearch:
                 incomplete.
         """
         limits = self.scene.limits
-        best, nearest, looks = math.inf, None, 0
+        best = math.inf
+        nearest = None
+        looks = 0
         first: tuple[float, int, PairResult] | None = None
         for k, bound in enumerate(self.bounds):
             if bound > limits.margin + limits.tolerance and (only_contacts or bound >= best):
@@ -121,7 +124,8 @@ class PathSearch:
             if found.contact is not None and motion.time(found.contact) < until:
                 first = (motion.time(found.contact), k, found)
             if found.least < best:
-                best, nearest = found.least, self.scene.names(self.pairs[k])
+                best = found.least
+                nearest = self.scene.names(self.pairs[k])
         if first is None:
             return SweepResult(None, best, nearest, looks=looks)
         contact = self.contact(*first[1:])
@@ -129,7 +133,9 @@ class PathSearch:
 
     def refined(self, guess: SweepResult) -> SweepResult:
         """Refine the least clearance of a free path, from a guess."""
-        best, nearest, looks = guess.min_clearance_mm, guess.nearest, guess.looks
+        best = guess.min_clearance_mm
+        nearest = guess.nearest
+        looks = guess.looks
         for k, bound in enumerate(self.bounds):
             if bound >= best - self.scene.limits.slack(best):
                 break
@@ -137,7 +143,8 @@ class PathSearch:
             least, more = refine_pair(self.motion(k), separate, self.scene.limits, best)
             looks += more
             if least < best:
-                best, nearest = least, self.scene.names(self.pairs[k])
+                best = least
+                nearest = self.scene.names(self.pairs[k])
         return SweepResult(None, best, nearest, looks=looks)
 
     def contact(self, k: int, found: PairResult) -> Contact:

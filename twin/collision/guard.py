@@ -59,7 +59,9 @@ class SceneGuard:
             positions: motor -> position [mm, deg].
         """
         parts = self.scene.parts
-        return self if parts is None or not parts.mounts else SceneGuard(parts.at(positions))
+        if parts is None or not parts.mounts:
+            return self
+        return SceneGuard(parts.at(positions))
 
     def touching(
         self, positions: Mapping[str, float], *, deep: bool = False
@@ -71,7 +73,8 @@ class SceneGuard:
             deep: measure overlaps, as negative clearances; it takes some milliseconds a
                 pair.
         """
-        scene, q = self.scene, self.scene.vector(positions)
+        scene = self.scene
+        q = self.scene.vector(positions)
         out: dict[tuple[str, str], float] = {}
         for pair, gap in bodies_touching(scene, q):  # a sample may be several bodies
             if deep and gap <= 0.0:

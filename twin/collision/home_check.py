@@ -29,14 +29,17 @@ def check_home(machine: Machine, profile: Profile, file: str) -> None:
     def wrong(what: str, **data: object) -> MachineFileError:
         return MachineFileError(f"{file}: axes: {what}", {"file": file, "path": "axes", **data})
 
-    stage, panel = place(machine, "object_y"), place(machine, "detector_y")
-    sod, sdd = stage.home, panel.home
+    stage = place(machine, "object_y")
+    panel = place(machine, "detector_y")
+    sod = stage.home
+    sdd = panel.home
     if not (math.isfinite(sod) and 0.0 < sod < sdd):
         what = f"at home SOD is {sod:g} mm and SDD {sdd:g} mm; allowed: 0 < SOD < SDD"
         more = "(flexdt machine check prints what they are the sum of)"
         raise wrong(f"{what} {more}", sod=sod, sdd=sdd)
     for at, offset in ((stage, profile.c_obj), (panel, profile.c_det)):
-        least, most = at.least + offset, at.most + offset
+        least = at.least + offset
+        most = at.most + offset
         if least <= 0.0:
             what = f"{at.name} goes from {least:g} to {most:g} mm over the travel ({at.total}; zero"
             more = f"offset {offset:g} mm); allowed: above 0 everywhere, in front of the focal spot"

@@ -131,7 +131,8 @@ class _Planner:
         ]
         out = {}
         for axis in dict.fromkeys([*goal, *movable]):
-            a, here = self.machine.axes[axis], self.at(axis)
+            a = self.machine.axes[axis]
+            here = self.at(axis)
             aside = [a.lower, a.upper, a.home, 0.5 * (a.lower + a.upper)]
             if a.kind == "rotation":
                 aside = [
@@ -194,12 +195,14 @@ class _Planner:
             before = earlier[-1] if earlier else self.at(axis)
             if value == goal.get(axis, self.at(axis)):
                 continue
-            short, long = 0.0, 1.0
+            short = 0.0
+            long = 1.0
             for _ in range(HALVINGS):
                 share = 0.5 * (short + long)
                 trial = [*way[:i], (axis, before + share * (value - before)), *way[i + 1 :]]
                 if self._all_free(trial):
-                    way, long = trial, share
+                    way = trial
+                    long = share
                 else:
                     short = share
         return way

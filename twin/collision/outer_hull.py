@@ -45,12 +45,16 @@ def outer_hull(points: npt.ArrayLike) -> Polytope:
     low, high = exact.bounds()
     lift = RELATIVE_LIFT * float((high - low).max())
     inside = exact.vertices.mean(axis=0)
-    chosen = [np.concatenate([s * e, [-float((s * exact.vertices @ e).max()) - lift]])
-              for e in np.eye(3) for s in (-1.0, 1.0)]  # fmt: skip
+    chosen = [
+        np.concatenate([s * e, [-float((s * exact.vertices @ e).max()) - lift]])
+        for e in np.eye(3)
+        for s in (-1.0, 1.0)
+    ]
     corners = _corners(chosen, inside)
     while True:
         out = corners @ planes[:, :3].T + planes[:, 3]
-        far, taken = out.max(axis=1), list[int]()
+        far = out.max(axis=1)
+        taken = list[int]()
         while far.max() > MIN_CUT_MM and len(taken) < PLANES_PER_CUT:
             taken.append(int(np.argmax(out[np.argmax(far)])))
             far[out[:, taken[-1]] > 0.0] = 0.0  # what a plane cuts off needs no second one

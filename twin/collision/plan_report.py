@@ -112,7 +112,8 @@ def _contacts(search: PathSearch) -> list[Contact]:
 
 def _contacts_of(search: PathSearch, k: int) -> list[Contact]:
     """Find the contacts of one pair; after each it must come free before it counts again."""
-    motion, limits = search.motion(k), search.scene.limits
+    motion = search.motion(k)
+    limits = search.scene.limits
     separate = search.scene.separation(search.pairs[k])
     out: list[Contact] = []
     start: Moment | None = START

@@ -115,7 +115,8 @@ def path_of(axes: Sequence[str], tables: Mapping[str, AxisPath], start: float, e
     times = times[(times >= start) & (times <= end)]
     if len(times) < 2:
         times = np.array([start, start])
-    begin, length = times[:-1], np.diff(times)
+    begin = times[:-1]
+    length = np.diff(times)
     q = np.tile([float(tables[name].x[0]) for name in axes], (len(times), 1))
     v, a = np.zeros((2, len(begin), len(axes)))
     for column, name, table in moving:
@@ -206,7 +207,8 @@ class _Bound:
         reaches `level`."""
         lengths = lengths[at.segment :].copy()
         lengths[0] -= at.dt
-        rate, growth = self.rate[at.segment :].copy(), self.growth[at.segment :]
+        rate = self.rate[at.segment :].copy()
+        growth = self.growth[at.segment :]
         rate[0] += growth[0] * at.dt
         change = lengths * (rate + 0.5 * growth * lengths)
         ends = value + np.cumsum(change)
@@ -263,7 +265,9 @@ class _Turn:
             path: all motors.
             kept: segments that matter.
         """
-        angle, rate, growth = path.q[:-1] @ body.turns, path.v @ body.turns, path.a @ body.turns
+        angle = path.q[:-1] @ body.turns
+        rate = path.v @ body.turns
+        growth = path.a @ body.turns
         after = rate + growth * np.diff(path.times)
         # A path is cut where a motor turns round. There rounding may leave a velocity that still
         # points the old way; the acceleration tells.
@@ -281,7 +285,8 @@ class _Turn:
 
     def orientation(self, at: Moment) -> FloatArray:
         """Compute the body's orientation at a moment, (3, 3)."""
-        i, dt = at.segment, at.dt
+        i = at.segment
+        dt = at.dt
         angle = self.angle[i] + dt * (self.rate[i] + 0.5 * dt * self.acceleration[i])
         return self.body.rotation(float(angle))
 
@@ -323,7 +328,8 @@ class RelativeMotion:
 
     def __init__(self, a: Body, b: Body, path: Path) -> None:
         slides = a.slides - b.slides
-        velocity, acceleration = path.v @ slides, path.a @ slides
+        velocity = path.v @ slides
+        acceleration = path.a @ slides
         changes = [velocity, acceleration]
         for body in (a, b):
             if body.spins:
@@ -333,7 +339,8 @@ class RelativeMotion:
         self.times: FloatArray = path.times[:-1][kept]
         self.lengths: FloatArray = np.diff(path.times)[kept]
         self._origin = (path.q @ slides + (a.origin - b.origin))[:-1][kept]
-        self._velocity, self._acceleration = velocity[kept], acceleration[kept]
+        self._velocity = velocity[kept]
+        self._acceleration = acceleration[kept]
         self._turn_a = _Turn.of(a, -1.0, path, kept) if a.spins else None
         self._turn_b = _Turn.of(b, 1.0, path, kept) if b.spins else None
         self._turning = [
@@ -364,7 +371,8 @@ class RelativeMotion:
 
     def look(self, at: Moment, separate: Separate) -> Look:
         """Compute the certified gap of the two bodies at a moment."""
-        i, dt = at.segment, at.dt
+        i = at.segment
+        dt = at.dt
         offset = self._origin[i] + dt * (self._velocity[i] + 0.5 * dt * self._acceleration[i])
         turn_a = None if self._turn_a is None else self._turn_a.orientation(at)
         turn_b = None if self._turn_b is None else self._turn_b.orientation(at)
@@ -417,7 +425,8 @@ class RelativeMotion:
         """Find the segment end after a look that is farthest towards b along its normal,
         unturned."""
         i = look.at.segment
-        slide, lengths = self._slide(look.normal), self.lengths[i:]
+        slide = self._slide(look.normal)
+        lengths = self.lengths[i:]
         change = lengths * (slide.rate[i:] + 0.5 * slide.growth[i:] * lengths)
         j = i + int(np.argmin(np.cumsum(change)))
         return Moment(j, float(self.lengths[j]))
@@ -484,16 +493,21 @@ def sweep_pair(
         start: where to begin.
         until: what happens after this time does not matter [s].
     """
-    level, near = floor(math.inf, limits.margin), limits.margin + limits.tolerance
+    level = floor(math.inf, limits.margin)
+    near = limits.margin + limits.tolerance
     clear = near + limits.tolerance
-    at, before, looks, least = start, None, 0, math.inf
+    at = start
+    before = None
+    looks = 0
+    least = math.inf
     while True:
         look = motion.look(at, separate)
         looks += 1
         least = min(least, look.gap)
         if looks == 1 and 0.0 < look.gap <= near:
             level = max(0.0, floor(look.gap, limits.margin))
-            near, clear = level + 0.5 * ROUNDING_MM, level + ROUNDING_MM
+            near = level + 0.5 * ROUNDING_MM
+            clear = level + ROUNDING_MM
         elif look.gap <= near:
             if before is None:
                 return PairResult(look.gap, at, None, looks)
@@ -508,7 +522,8 @@ def sweep_pair(
     # Free. Where it ends nearest is a good guess of the least clearance.
     end = motion.nearest_end(before)
     if motion.time(end) <= until:
-        least, looks = min(least, motion.look(end, separate).gap), looks + 1
+        least = min(least, motion.look(end, separate).gap)
+        looks = looks + 1
     return PairResult(least, None, None, looks)
 
 

@@ -68,7 +68,8 @@ def _of_pair(scene: CollisionScene, path: Path, pair: Pair) -> Contact | None:
     """Find the contact that stops one overlapping pair: coming closer, or touching again
     once free."""
     a, b = (scene.bodies[i] for i in pair)
-    motion, overlap = RelativeMotion(a, b, path), _Overlap.at(a, b, path.q[0])
+    motion = RelativeMotion(a, b, path)
+    overlap = _Overlap.at(a, b, path.q[0])
     deeper = _deeper(motion, overlap, scene.limits.margin)
     until = math.inf if deeper is None else motion.time(deeper[1])
     free = _free_from(motion, scene.separation(pair), scene.limits, until)
@@ -90,7 +91,8 @@ def _deeper(
     look = motion.look(START, overlap.separate)
     level = floor(look.gap, margin)
     while (at := motion.next_at(look, level)) is not None:
-        before, look = look.at, motion.look(at, overlap.separate)
+        before = look.at
+        look = motion.look(at, overlap.separate)
         if look.gap <= level + 0.5 * ROUNDING_MM:
             return before, at
     return None
@@ -180,7 +182,8 @@ class _Overlap:
         turned = (np.eye(3) if turn_a is None else turn_a, np.eye(3) if turn_b is None else turn_b)
         off = (np.abs(now - then).max() for now, then in zip(turned, self.turned, strict=True))
         turns = max(off) > ORIENTATION_ROUNDING
-        widest, across = -math.inf, self.directions[0]
+        widest = -math.inf
+        across = self.directions[0]
         for i in (0, 1) if turns else (0,):
             if turns and _many(self.bodies[1 - i].solid):
                 continue
@@ -189,7 +192,8 @@ class _Overlap:
             gaps = now @ offset - self._reach[i] - other
             best = int(np.argmax(gaps))
             if gaps[best] > widest:
-                widest, across = float(gaps[best]), now[best]
+                widest = float(gaps[best])
+                across = now[best]
         return widest, across
 
     def separation(self, q: FloatArray) -> float:

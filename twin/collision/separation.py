@@ -97,7 +97,8 @@ def _improved(
     """
     from scipy.optimize import nnls
 
-    normal, corners = found[1], []
+    normal = found[1]
+    corners = []
     for _ in range(MAX_SEARCH_STEPS):
         corners.append(offset + ra @ a.farthest(-normal @ ra) - rb @ b.farthest(normal @ rb))
         found = max(found, (float(normal @ corners[-1]), normal), key=lambda f: f[0])

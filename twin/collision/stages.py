@@ -115,7 +115,9 @@ class Body:
         root = ahead + np.sqrt(ahead * ahead + 2.0 * curve * room)
         turn = float((2.0 * room / (root + TINY)).min())
         # A point that moves away comes back after half a turn.
-        return turn if sense == 0.0 else min(turn, math.pi)
+        if sense == 0.0:
+            return turn
+        return min(turn, math.pi)
 
     @cached_property
     def _levers(self) -> FloatArray:
@@ -260,7 +262,8 @@ def _chain(
     chain = machine.chain(part)
     columns = {name: i for i, name in enumerate(machine.axes)}
     origin = np.zeros(3)
-    slides, turns = np.zeros((len(columns), 3)), np.zeros(len(columns))
+    slides = np.zeros((len(columns), 3))
+    turns = np.zeros(len(columns))
     for i, coordinate in enumerate(COORDINATES):
         factors = machine.geometry.get(f"{part.anchor}_{coordinate}", {})
         for motor in chain:

@@ -115,13 +115,17 @@ class Follower:
         if heard.what == "FDB":
             mirror = replace(mirror, speaks=mirror.speaks is not False)
             return self._read(mirror, heard, waiting, now)
-        return mirror if heard.what == "RCV" else self._ended(mirror, heard, waiting, now)
+        if heard.what == "RCV":
+            return mirror
+        return self._ended(mirror, heard, waiting, now)
 
     def tick(self, mirror: Mirror, now: float) -> Mirror:
         """Update the mirror after time without a message: raise alarms for what is overdue."""
         mirror = self._over(mirror, "", now) if mirror.ends is False else mirror
         for waiting in mirror.waiting.values():
-            took, quiet, about = now - waiting.sent_s, now - waiting.told_s, waiting.heard.words[0]
+            took = now - waiting.sent_s
+            quiet = now - waiting.told_s
+            about = waiting.heard.words[0]
             expected = waiting.predicted_s is not None and not waiting.superseded
             overdue = took > waiting.most_s + SLACK_S
             if expected and overdue and mirror.ends is not False:
@@ -134,7 +138,8 @@ class Follower:
             if quiet > max(FORGOTTEN_AFTER_S, waiting.most_s):
                 mirror = _rests(mirror.finished(waiting.heard), waiting)
         for name, axis in mirror.axes.items() if mirror.ends is False else ():
-            told, path = axis.heard_s or 0.0, axis.path
+            told = axis.heard_s or 0.0
+            path = axis.path
             if path is not None and path.end < told < now - axis.delay_s - SLACK_S:
                 mirror = self._arrival(mirror, name, axis.position, path.target, now)
         if mirror.due_s is not None and now > mirror.due_s + SLACK_S:
@@ -256,7 +261,8 @@ class Follower:
         arrived = {n: p.target for n, p in paths.items() if n not in moving}
         start = replace(mirror.start, positions={**mirror.positions, **arrived})
         sim = Simulation(self.machine, start)
-        sim.now, sim.tube.ready_at = now, mirror.ready_s
+        sim.now = now
+        sim.tube.ready_at = mirror.ready_s
         for name, path in moving.items():
             sim.motors.all[name].moves.append((path.start, path))
         sim.run((replace(command, wait=c.Wait.ACK),))
@@ -274,8 +280,14 @@ class Follower:
         for name in moved:
             path = sim.motors.all[name].moves[-1][1]
             rests = mirror.axes[name].at_rest
-            axis = replace(rests, begun_s=waiting.heard.late_s, delay_s=delay, path=path,
-                           target=path.target, mover=waiting.heard.identity)  # fmt: skip
+            axis = replace(
+                rests,
+                begun_s=waiting.heard.late_s,
+                delay_s=delay,
+                path=path,
+                target=path.target,
+                mover=waiting.heard.identity,
+            )
             mirror = replace(mirror, axes={**mirror.axes, name: axis})
             mirror = self._near_limit(mirror, name, path.target, now)
         known = waiting.heard.words[0] in (*self.machine.axes, *self.machine.virtual_axes)
@@ -298,7 +310,9 @@ class Follower:
         """Find the command in the script: advance, or raise an alarm."""
         if self.script is None:
             return mirror
-        bare, lines, at = _bare(command), self._bare, mirror.next_line
+        bare = _bare(command)
+        lines = self._bare
+        at = mirror.next_line
         if at >= len(lines) and lines and bare == lines[0]:
             at = 0
         if at < len(lines) and bare == lines[at]:
@@ -319,7 +333,9 @@ class Follower:
     @cached_property
     def _bare(self) -> tuple[c.Command, ...]:
         """Commands of the script without place, wait and times."""
-        return () if self.script is None else tuple(map(_bare, self.script.commands))
+        if self.script is None:
+            return ()
+        return tuple(map(_bare, self.script.commands))
 
     @cached_property
     def _steps(self) -> tuple[PlanStep, ...]:
@@ -359,7 +375,8 @@ class Follower:
         if passed:  # the motor goes on, and its reply at the end may come or not
             return mirror.with_waiting(waiting, superseded=True, written=True)
         if waiting.predicted_s is not None and not waiting.superseded:
-            least, most = took - heard.late_s, took + waiting.heard.late_s
+            least = took - heard.late_s
+            most = took + waiting.heard.late_s
             if most < waiting.least_s - SLACK_S or least > waiting.most_s + SLACK_S:
                 mirror = self._outside(mirror, waiting, took, now)
             else:
@@ -384,7 +401,9 @@ class Follower:
         name, there = self._motor(axis, at)
         mirror = self._arrival(mirror, name, there, waiting.targets[name], now)
         mirror = mirror.with_axis(name, position=there) if name in own else mirror
-        return mirror if motor is None else self._compared(mirror, name, motor, now)
+        if motor is None:
+            return mirror
+        return self._compared(mirror, name, motor, now)
 
     def _arrival(self, mirror: Mirror, name: str, there: float, meant: float, now: float) -> Mirror:
         """Raise an alarm if a motor is not where its move led."""
@@ -399,9 +418,12 @@ class Follower:
         axis = self.machine.axes[name]
         for what, theirs, ours in (
             ("limits", (motor.lower, motor.upper), (axis.lower, axis.upper)),
-            ("rates", (motor.max_speed, motor.max_acceleration),
-             (axis.max_speed, axis.max_acceleration)),
-        ):  # fmt: skip
+            (
+                "rates",
+                (motor.max_speed, motor.max_acceleration),
+                (axis.max_speed, axis.max_acceleration),
+            ),
+        ):
             if any(abs(a - b) > 1e-6 * (1.0 + abs(b)) for a, b in zip(theirs, ours, strict=True)):
                 text = (
                     f"{name}: the motor's own {what} are {theirs[0]:g} and {theirs[1]:g}, machine "
@@ -420,7 +442,8 @@ class Follower:
             now: time [s].
         """
         asks = heard.asks or (waiting.heard.asks if waiting is not None else "")
-        axis, motor = heard.words[0], motor_reply(reply_bytes(heard.reply))
+        axis = heard.words[0]
+        motor = motor_reply(reply_bytes(heard.reply))
         at = motor.position if motor is not None else _number(heard.reply)
         moves = waiting is not None and bool(waiting.targets)
         known = self.machine.has(axis) and (moves or asks == "position" or motor is not None)
@@ -430,7 +453,8 @@ class Follower:
         if waiting is not None and moves and not _stays(mirror, name, waiting):
             return mirror
         mirror = mirror if motor is None else self._compared(mirror, name, motor, now)
-        seen, path = mirror.axes[name], mirror.axes[name].path
+        seen = mirror.axes[name]
+        path = mirror.axes[name].path
         unit = self.machine.axes[name].unit
         if path is None:
             mirror = mirror.with_axis(name, position=x, target=x, heard_s=now)
@@ -449,11 +473,14 @@ class Follower:
         if moves and passes == seen.passed_s and now - (seen.heard_s or now) < MAX_SILENCE_S:
             return mirror  # that one once more
         if arrived or abs(x - path.pieces[0].position) <= TARGET_TOLERANCE:
-            return here if passes is None else here.with_axis(name, passed_s=passes)
+            if passes is None:
+                return here
+            return here.with_axis(name, passed_s=passes)
         if passes is None:
             what = f"{name} is at {x:.6g} {unit}, on no way to {path.target:.6g}"
             return _alarm(here, now, "error", "off_path", name, what)
-        least, most = now - heard.late_s - passes, now - passes
+        least = now - heard.late_s - passes
+        most = now - passes
         first = seen.behind_s or (least, most)
         if least > seen.delay_s + SLACK_S or least - first[1] > MAX_DRIFT_S:
             what = f"{name} is slow: {least:.2f} s behind the predicted path at {x:.6g} {unit}"
@@ -492,7 +519,9 @@ def _bounds(step: PlanStep, machine: Machine) -> Range:
     A time that is only assumed may be anything up to twice itself.
     """
     found = step_range(step, machine.timing)
-    return (step.computed_s, step.holds_s + step.assumed_s) if found is None else _wider(found)
+    if found is None:
+        return (step.computed_s, step.holds_s + step.assumed_s)
+    return _wider(found)
 
 
 def _wider(found: Range) -> Range:
@@ -520,7 +549,9 @@ def _bare(command: c.Command) -> c.Command:
     bare = replace(command, line=0, column=1, wait=c.Wait.ACK, timeout_ms=None, expected_ms=None)
     if isinstance(bare, c.MotorCommand):
         bare = replace(bare, component=bare.component.lower())
-    return replace(bare, trigger=None) if isinstance(bare, c.MoveAbsolute) else bare
+    if isinstance(bare, c.MoveAbsolute):
+        return replace(bare, trigger=None)
+    return bare
 
 
 def _flushed(mirror: Mirror, now: float) -> Mirror:
@@ -537,7 +568,8 @@ def _flushed(mirror: Mirror, now: float) -> Mirror:
 
 def _line(waiting: Waiting, wait: str, took: float, reply: str) -> tuple[bytes, ...]:
     """Format the record's line of a command that a script can have."""
-    command, words = waiting.heard.command, waiting.heard.words
+    command = waiting.heard.command
+    words = waiting.heard.words
     if waiting.written or command is None:
         return ()
     if isinstance(command, c.MoveAbsolute) and words[1] != "move absolute":

@@ -258,7 +258,9 @@ class Mirror:
 
     def age_s(self, now: float) -> float | None:
         """Return the age of the last message [s]; None if there was none."""
-        return None if self.heard_s is None else max(0.0, now - self.heard_s)
+        if self.heard_s is None:
+            return None
+        return max(0.0, now - self.heard_s)
 
     def with_axis(self, name: str, **changes: object) -> Mirror:
         """Change one axis."""
@@ -276,14 +278,18 @@ class Mirror:
     def cleared(self, about: str, *kinds: str) -> Mirror:
         """End the conditions about something, of these kinds or of all."""
         gone = {k for k in self.active if k[1] == about and (not kinds or k[0] in kinds)}
-        return replace(self, active=self.active - gone) if gone else self
+        if gone:
+            return replace(self, active=self.active - gone)
+        return self
 
     def to_dict(self, now: float) -> dict[str, object]:
         """Return the JSON form at a moment: the public fields, and their ages [s]."""
 
         def ago(then: float | None) -> float | None:
             """Return an age to the millisecond."""
-            return None if then is None else round(max(0.0, now - then), 3)
+            if then is None:
+                return None
+            return round(max(0.0, now - then), 3)
 
         return {
             "connected": self.connected,

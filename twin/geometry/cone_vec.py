@@ -142,9 +142,16 @@ class ConeVec:
             [[2.0, 459.0, -1.0]]
         """
         return cls.helical(
-            sod=sod, sdd=sdd, angles=angles, rise=0.0, shape=shape, pixel=pixel, offset=offset,
-            tilts=tilts, height=height,
-        )  # fmt: skip
+            sod=sod,
+            sdd=sdd,
+            angles=angles,
+            rise=0.0,
+            shape=shape,
+            pixel=pixel,
+            offset=offset,
+            tilts=tilts,
+            height=height,
+        )
 
     @classmethod
     def helical(
@@ -182,10 +189,8 @@ class ConeVec:
             [-4.0, 4.0]
         """
         if not np.isfinite(rise) or not (np.isfinite(turns) and turns > 0):
-            asked, allowed = (
-                f"rise {rise:g} mm a turn, {turns:g} turns",
-                "finite, more than 0 turns",
-            )
+            asked = f"rise {rise:g} mm a turn, {turns:g} turns"
+            allowed = "finite, more than 0 turns"
             raise GeometryError.instead(asked, [rise, turns], allowed)
         given = _stage_angles(angles, turns)
         rises = rise * (given - (given[0] + given[-1]) / 2) / FULL_TURN_DEG
@@ -200,12 +205,14 @@ class ConeVec:
         if min(pitch) <= 0.0:
             asked = f"pixel {pitch[0]:g} x {pitch[1]:g} mm"
             raise GeometryError.instead(asked, list(pitch), "more than 0")
-        right, below = np.array(COLUMN_DIRECTION), np.array(ROW_DIRECTION)
+        right = np.array(COLUMN_DIRECTION)
+        below = np.array(ROW_DIRECTION)
         # At stage angle 0; the object turns clockwise, so these turn the other way in its frame.
         source = np.array([0.0, -sod, height])
         centre = np.array([0.0, sdd - sod, height]) + columns * right + down * below
         u, v = turn_detector(right * pitch[0], below * pitch[1], yaw, tilt, roll)
-        turn, up = rotation_z(np.radians(given)), np.multiply.outer(rises, np.array(UP))
+        turn = rotation_z(np.radians(given))
+        up = np.multiply.outer(rises, np.array(UP))
         parts = turn @ source + up, turn @ centre + up, turn @ u, turn @ v
         return cls(np.concatenate(parts, axis=1), shape)
 
@@ -427,7 +434,9 @@ class ConeVec:
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:
         """The rows, (n, 12)."""
-        return np.array(self.rows, dtype=dtype) if copy else np.asarray(self.rows, dtype=dtype)
+        if copy:
+            return np.array(self.rows, dtype=dtype)
+        return np.asarray(self.rows, dtype=dtype)
 
     def __eq__(self, other: object) -> bool:
         return (
@@ -787,7 +796,8 @@ def _formats() -> Any:
 
 def _span(values: FloatArray) -> str:
     """Format the range of values."""
-    low, high = f"{values.min():.6g}", f"{values.max():.6g}"
+    low = f"{values.min():.6g}"
+    high = f"{values.max():.6g}"
     return low if low == high else f"{low} to {high}"
 
 
@@ -843,7 +853,8 @@ def check_cone_vec(cone_vec: ConeVec, pixel_mm: float | tuple[float, float]) -> 
         >>> check_cone_vec(scan, 0.15) is scan
         True
     """
-    u, v = cone_vec.u, cone_vec.v
+    u = cone_vec.u
+    v = cone_vec.v
     lengths = {"|u|": np.linalg.norm(u, axis=1), "|v|": np.linalg.norm(v, axis=1)}
     pitches = pixel_mm if isinstance(pixel_mm, tuple) else (pixel_mm, pixel_mm)
     for (name, length), pitch in zip(lengths.items(), pitches, strict=True):

@@ -76,7 +76,8 @@ def rotation_x(angle: float) -> FloatArray:
         >>> (rotation_x(np.pi / 2) @ [0, 1, 0]).round(9).tolist()
         [0.0, 0.0, 1.0]
     """
-    c, s = math.cos(angle), math.sin(angle)
+    c = math.cos(angle)
+    s = math.sin(angle)
     return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
 
 
@@ -87,7 +88,8 @@ def rotation_y(angle: float) -> FloatArray:
         >>> (rotation_y(np.pi / 2) @ [0, 0, 1]).round(9).tolist()
         [1.0, 0.0, 0.0]
     """
-    c, s = math.cos(angle), math.sin(angle)
+    c = math.cos(angle)
+    s = math.sin(angle)
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 
 
@@ -99,7 +101,8 @@ def rotation_z(angle: float | FloatArray) -> FloatArray:
         [0.0, 1.0, 0.0]
     """
     a = np.asarray(angle, dtype=np.float64)
-    c, s = np.cos(a), np.sin(a)
+    c = np.cos(a)
+    s = np.sin(a)
     out = np.zeros((*a.shape, 3, 3))
     out[..., 0, 0] = c
     out[..., 0, 1] = -s

@@ -85,8 +85,11 @@ def require_plausible(parameters: Offsets, reach_mm: float) -> None:
     Raises:
         GeometryError: an offset is out of its range; the message names it.
     """
-    ranges = {"mm": (-reach_mm, reach_mm), "deg": (-MAX_TILT_DEG, MAX_TILT_DEG),
-              "1": ANGLE_SCALE_RANGE}  # fmt: skip
+    ranges = {
+        "mm": (-reach_mm, reach_mm),
+        "deg": (-MAX_TILT_DEG, MAX_TILT_DEG),
+        "1": ANGLE_SCALE_RANGE,
+    }
     for name, value in parameters.to_edge().items():
         low, high = ranges[UNITS[name]]
         if name != "alpha" and not low <= value <= high:
@@ -102,7 +105,9 @@ def to_internal(name: str, value: float) -> float:
         >>> round(to_internal("det_roll", 180.0), 6), to_internal("dS_x", 2.0)
         (3.141593, 2.0)
     """
-    return math.radians(value) if UNITS[name] == "deg" else float(value)
+    if UNITS[name] == "deg":
+        return math.radians(value)
+    return float(value)
 
 
 def to_edge(name: str, value: float) -> float:
@@ -112,4 +117,6 @@ def to_edge(name: str, value: float) -> float:
         >>> round(to_edge("det_roll", to_internal("det_roll", 0.5)), 9)
         0.5
     """
-    return math.degrees(value) if UNITS[name] == "deg" else float(value)
+    if UNITS[name] == "deg":
+        return math.degrees(value)
+    return float(value)

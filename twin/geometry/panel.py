@@ -82,7 +82,8 @@ class PanelModel:
         """Compute shifts (..., 2, m) for a coefficient of 1 at places (..., 2), pixels
         (column, row)."""
         rows, cols = self.shape
-        middle, half = np.array([cols - 1, rows - 1]) / 2, max(rows, cols) / 2
+        middle = np.array([cols - 1, rows - 1]) / 2
+        half = max(rows, cols) / 2
         x, y = np.moveaxis((places - middle) / half, -1, 0)
         zero = np.zeros_like(x)
         bent = [x**i * y**j for i, j in TERM_POWERS]
@@ -131,7 +132,8 @@ class Panel:
         for _ in range(4):  # A distortion is smooth: each time, little is left of the error.
             out = places + self.shift(out)
         for border in self.model.borders:  # What lies in a gap is between the lines beside it.
-            axis, first = border.axis, math.ceil(border.at)
+            axis = border.axis
+            first = math.ceil(border.at)
             sides = np.stack([places[:, :1] if axis == 0 else places[:1]] * 2)
             sides[0, ..., axis], sides[1, ..., axis] = first - 1, first
             low, high = (sides - self.shift(sides))[..., axis]
@@ -143,7 +145,8 @@ class Panel:
     def without_lag(self, image: Float32Array, before: Float32Array) -> Float32Array:
         """Subtract from line integrals (rows, cols) the light of the frame `before`, as
         that shows it itself: of a lag of 5 % some 0.2 % remain."""
-        share, shown = self.lag / (1.0 - self.lag), np.exp(-image)
+        share = self.lag / (1.0 - self.lag)
+        shown = np.exp(-image)
         light = (shown - share * np.exp(-before)) / (1.0 - share)
         return np.asarray(-np.log(np.maximum(light, MIN_LIGHT_SHARE * shown)), dtype=np.float32)
 
@@ -170,11 +173,12 @@ class Panel:
         return {
             "model": "cubic",
             "shape": list(self.model.shape),
-            "borders": [{"axis": ("column", "row")[b.axis], "from": b.at}
-                        for b in self.model.borders],
+            "borders": [
+                {"axis": ("column", "row")[b.axis], "from": b.at} for b in self.model.borders
+            ],
             "coefficients": dict(zip(self.model.names, self.coefficients, strict=True)),
             **({"lag": self.lag} if self.lag else {}),
-        }  # fmt: skip
+        }
 
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> Panel:

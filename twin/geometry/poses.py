@@ -106,7 +106,8 @@ class Poses:
             >>> len(poses), poses.sdd.tolist()
             (2, [1059.0, 1059.0])
         """
-        u, v = np.multiply(COLUMN_DIRECTION, pixel), np.multiply(ROW_DIRECTION, pixel)
+        u = np.multiply(COLUMN_DIRECTION, pixel)
+        v = np.multiply(ROW_DIRECTION, pixel)
         return cls(source, axis, detector, u, v, angle)  # type: ignore[arg-type]
 
     @classmethod

@@ -70,7 +70,8 @@ def stretched(cone_vec: ConeVec, times: FloatArray) -> ConeVec:
 def stretched_steps(rows: FloatArray, times: FloatArray) -> FloatArray:
     """Stretch rows (n, 12), or changes of them, to panels `times` (n,) as far from the
     source."""
-    out, many = rows.copy(), times[:, None]
+    out = rows.copy()
+    many = times[:, None]
     out[:, 3:6] = rows[:, :3] + many * (rows[:, 3:6] - rows[:, :3])
     out[:, 6:] = many * rows[:, 6:]
     return out
@@ -79,7 +80,8 @@ def stretched_steps(rows: FloatArray, times: FloatArray) -> FloatArray:
 def relaxed_gradient(gradient: FloatArray, times: FloatArray) -> FloatArray:
     """Convert derivatives (n, 12) by the rows of `stretched_steps` to those by the
     original rows."""
-    out, many = gradient.copy(), times[:, None]
+    out = gradient.copy()
+    many = times[:, None]
     out[:, :3] = gradient[:, :3] + (1.0 - many) * gradient[:, 3:6]
     out[:, 3:] = many * gradient[:, 3:]
     return out

@@ -86,7 +86,8 @@ class CameraSettings:
     @property
     def shape(self) -> tuple[int, int]:
         """Image shape (rows, cols); a rest that does not fill a binned pixel is cut off."""
-        b, r = self.binning, self.roi
+        b = self.binning
+        r = self.roi
         return (r.bottom - r.top + 1) // b, (r.right - r.left + 1) // b
 
     @property
@@ -126,7 +127,8 @@ class CameraSettings:
             (along growing columns, along growing rows).
         """
         rows, cols = self.shape
-        b, r = self.binning, self.roi
+        b = self.binning
+        r = self.roi
         column = r.left + (cols * b - 1) / 2 - (grid.columns - 1) / 2
         row = r.top + (rows * b - 1) / 2 - (grid.rows - 1) / 2
         return column * grid.pitch_mm, row * self.pixels_mm(grid)[1] / b

@@ -429,7 +429,9 @@ class Timing(_Frozen):
     @property
     def sequence(self) -> str:
         """Kind whose time a sequence of images takes beyond its exposures."""
-        return "take_image_overhead" if self.sequence_overhead_s is None else "sequence_overhead"
+        if self.sequence_overhead_s is None:
+            return "take_image_overhead"
+        return "sequence_overhead"
 
     @model_validator(mode="after")
     def _spreads_hold(self) -> Timing:
@@ -856,7 +858,8 @@ def _meshed(own: Raw, corners: Corners | None) -> Raw:
     parts = own.get("components", [])
     meshed = [p for p in parts if isinstance(p, dict) and "mesh" in p] if parts else []
     for part in meshed:
-        where, name = f"components.{part.get('name')}", part["mesh"]
+        where = f"components.{part.get('name')}"
+        name = part["mesh"]
         said = [key for key in ("shape", "size_mm", "center_mm", "points_mm") if key in part]
         if said:
             raise UnknownNameError(f"{where}.{said[0]}: must be left out: the mesh says it")
@@ -879,7 +882,8 @@ def _meshed(own: Raw, corners: Corners | None) -> Raw:
 
 def _inherited(own: Raw) -> Raw:
     """Merge a machine's content into that of its base."""
-    name, without = own.pop("base", None), own.pop("without", [])
+    name = own.pop("base", None)
+    without = own.pop("without", [])
     if name is None and not without:
         return own
     if not isinstance(name, str):
@@ -988,7 +992,8 @@ def _parse(model: type[_M], prepared: Callable[[Raw], Raw], text: str, file: str
     except OverflowError as error:
         raise MachineFileError(f"{file}: a number is too large: {error}", {"file": file}) from None
     except ValidationError as error:
-        lines, data = [], []
+        lines = []
+        data = []
         for e in error.errors():
             at = e.get("ctx", {}).get("at")
             path = ".".join(str(p) for p in (*e["loc"], *([] if at is None else [at])))
@@ -1009,7 +1014,9 @@ def _limit(path: str) -> str:
     """Return what docs/limits.md says of a key, to end an error with, or ""."""
     last = path.rpartition(".")[2].lower()
     said = next((text for key, text in _KEY_LIMITS.items() if last.startswith(key)), None)
-    return f"; {said} (docs/limits.md)" if said else ""
+    if said:
+        return f"; {said} (docs/limits.md)"
+    return ""
 
 
 def _require(

@@ -211,13 +211,16 @@ def _too_far(
     """Convert a motor's limit error to one of the axis that was to move."""
     if axis in machine.axes:
         return error
-    here, ends = virtual_reading(machine, axis, positions), []
+    here = virtual_reading(machine, axis, positions)
+    ends = []
     for motor, factor in machine.moves(axis).items():
         a = machine.axes[motor]
         left = (a.lower - positions[motor], a.upper - positions[motor])
         ends.append(sorted(here + way / factor for way in left))
-    low, high = max(low for low, _ in ends), min(high for _, high in ends)
-    target, unit = here + value if relative else value, error.data["unit"]
+    low = max(low for low, _ in ends)
+    high = min(high for _, high in ends)
+    target = here + value if relative else value
+    unit = error.data["unit"]
     said = (
         f"{axis} target {target:g} {unit} is outside [{low:g}, {high:g}] {unit}, "
         f"which is how far its motors go from here: {error}"
@@ -263,7 +266,8 @@ def place(machine: Machine, quantity: str) -> Place:
         machine.sample_height_mm if quantity == "object_z" else 0.0
     )
     words = [f"{fixed:g}"] if fixed else []
-    ends, home = [fixed, fixed], fixed
+    ends = [fixed, fixed]
+    home = fixed
     for motor, factor in machine.geometry.get(quantity, {}).items():
         axis = machine.axes[motor]
         both = sorted((factor * axis.lower, factor * axis.upper))

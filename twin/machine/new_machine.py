@@ -75,7 +75,8 @@ def new_machine_text(answers: Answers) -> str:
     panel = next((part for part in base.components if part.role == "panel"), None)
     fixed: dict[str, float] = {}
     rail: dict[str, object] = {}
-    without, limits = list(answers.without), dict(answers.limits)
+    without = list(answers.without)
+    limits = dict(answers.limits)
     for quantity, what, distance in (
         ("object_y", "SOD", answers.sod_mm),
         ("detector_y", "SDD", answers.sdd_mm),
@@ -153,7 +154,8 @@ def new_machine_text(answers: Answers) -> str:
 
 def _detector(answers: Answers, base: Machine) -> dict[str, object]:
     """Collect the values of `[detector]`; None for those that stay."""
-    pitch, own = answers.pitch_mm, base.detector
+    pitch = answers.pitch_mm
+    own = base.detector
     out: dict[str, object] = {
         "columns": answers.columns,
         "rows": answers.rows,
@@ -162,7 +164,8 @@ def _detector(answers: Answers, base: Machine) -> dict[str, object]:
         "bits": answers.bits,
     }
     if answers.columns is not None or answers.rows is not None:
-        columns, rows = answers.columns or own.columns, answers.rows or own.rows
+        columns = answers.columns or own.columns
+        rows = answers.rows or own.rows
         out |= {"model": f"panel {columns} x {rows}", "roi": [0, 0, columns - 1, rows - 1]}
     return out
 

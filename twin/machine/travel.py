@@ -57,7 +57,8 @@ def arrival(machine: Machine, axis: str, targets: Mapping[str, float]) -> Arriva
         axis: motor or virtual axis that is moved.
         targets: motor -> target as asked [mm, deg].
     """
-    told, beyond = [], None
+    told = []
+    beyond = None
     for motor, target in targets.items():
         left = _distance_beyond(machine, motor, target)
         if left <= POSITION_ROUNDING:
@@ -79,10 +80,13 @@ def rate(machine: Machine, axis: str, what: Rate, value: float) -> Arrival:
         what: speed or acceleration.
         value: of the axis [mm or deg, per s or s2].
     """
-    motors, told, beyond = {}, [], None
+    motors = {}
+    told = []
+    beyond = None
     for motor, share in machine.moves(axis).items():
         a = machine.axes[motor]
-        asked, most = value * abs(share), a.max_speed if what == "speed" else a.max_acceleration
+        asked = value * abs(share)
+        most = a.max_speed if what == "speed" else a.max_acceleration
         if not asked <= most * (1.0 + POSITION_ROUNDING):  # as one that is no number
             unit = f"{a.unit}/{'s' if what == 'speed' else 's2'}"
             told.append(f"{motor} {what} {asked:g} {unit} is above {most:g} {unit}")

@@ -111,7 +111,8 @@ def braked_apart(
     out = {}
     for name, drive in drives.items():
         if drive.end > now:
-            current, takes = drive.at(now), seconds[name]
+            current = drive.at(now)
+            takes = seconds[name]
             rest = motion.at_rest(current.position(now), now)
             if takes > 0.0:
                 acceleration = abs(velocity[name]) / takes
@@ -141,7 +142,8 @@ def coasting(
     for name, drive in drives.items():
         if drive.end <= now:
             continue
-        current, axis = drive.at(now), machine.axes[name]
+        current = drive.at(now)
+        axis = machine.axes[name]
         free = motion.stop(current.position(now), current.velocity(now), decelerations[name], now)
         end = min(max(free.target, axis.lower), axis.upper)
         met = None if end == free.target else free.time_at(end)
@@ -157,7 +159,9 @@ def programme_time_at_rest(drives: Drives, at: float, most: Most) -> float:
     """Compute the programme time [s] at which a stop along the path, begun at `at`, ends."""
     due = {name: drive for name, drive in drives.items() if drive.end > at}
     cells = _cells(due, at, most)
-    return cells[-1].programme + cells[-1].advance if cells else at
+    if cells:
+        return cells[-1].programme + cells[-1].advance
+    return at
 
 
 def braked_at(
@@ -187,7 +191,9 @@ def greatest(name: str, leg: Trajectory, time: float, most: Most) -> float:
     """Return the acceleration that a motor may brake with while it follows `leg` [mm/s2,
     deg/s2]."""
     planned = leg.acceleration(time)
-    return planned if most is None else max(planned, most[name])
+    if most is None:
+        return planned
+    return max(planned, most[name])
 
 
 def _cells(drives: Drives, now: float, most: Most) -> list[_Cell]:
@@ -202,7 +208,9 @@ def _cells(drives: Drives, now: float, most: Most) -> list[_Cell]:
         Cells that join up, until the rate is zero.
     """
     cells: list[_Cell] = []
-    s, rate, time = now, 1.0, now
+    s = now
+    rate = 1.0
+    time = now
     while rate > 0.0 and drives:
         states = [_state(name, drive, s, most) for name, drive in drives.items()]
         if max(abs(state.velocity) for state in states) < VELOCITY_ROUNDING:
@@ -211,7 +219,8 @@ def _cells(drives: Drives, now: float, most: Most) -> list[_Cell]:
         ahead = until - s
         if ahead <= TIME_ROUNDING_S:  # a knot that rounding has put a hair ahead
             step = max(TIME_ROUNDING_S, 4.0 * math.ulp(s))
-            s, time = s + step, time + step
+            s = s + step
+            time = time + step
             continue
         roughly = min(state.slowing(rate, 0.0) for state in states)
         # Where a motor accelerates, constant acceleration is an approximation over a short time;
@@ -229,7 +238,8 @@ def _cells(drives: Drives, now: float, most: Most) -> list[_Cell]:
         cell = _Cell(time, s, rate, slowing, length)
         cells.append(cell)
         s = until if ahead == until - s else s + cell.advance
-        rate, time = following, time + length
+        rate = following
+        time = time + length
     return cells
 
 
@@ -245,7 +255,8 @@ class _State:
     def slowing(self, rate: float, ahead: float) -> float:
         """Compute how much programme time may slow over the next `ahead` programme
         seconds [1/s]."""
-        speed, a = abs(self.velocity), abs(self.acceleration)
+        speed = abs(self.velocity)
+        a = abs(self.acceleration)
         if self.velocity * self.acceleration < 0.0:  # it brakes: both are greatest at the start
             return max(0.0, self.most - a * rate * rate) / speed
         fastest = speed + a * ahead
@@ -269,7 +280,8 @@ def _state(name: str, drive: Drive, s: float, most: Most) -> _State:
 def _along(drive: Drive, cells: list[_Cell], now: float) -> Trajectory:
     """Convert the cells to one motor's trajectory."""
     pieces: list[Piece] = []
-    end, target = now, drive.at(now).position(now)
+    end = now
+    target = drive.at(now).position(now)
     for cell in cells:
         leg = drive.at(cell.programme)
         velocity, acceleration, _ = leg.law(cell.programme)
@@ -277,7 +289,8 @@ def _along(drive: Drive, cells: list[_Cell], now: float) -> Trajectory:
             if pieces and (pieces[-1].velocity != 0.0 or pieces[-1].acceleration != 0.0):
                 pieces.append(Piece(end, target, 0.0, 0.0))
             continue
-        ds, left = cell.advance, cell.rate - cell.slowing * cell.length
+        ds = cell.advance
+        left = cell.rate - cell.slowing * cell.length
         x = leg.position(cell.programme)
         v = velocity * cell.rate
         gone = ds * (velocity + 0.5 * acceleration * ds)
@@ -292,16 +305,19 @@ def _along(drive: Drive, cells: list[_Cell], now: float) -> Trajectory:
             pieces.append(Piece(cell.start, x, v, (arrives - v) / cell.length))
         else:
             # Two halves of constant acceleration that meet position and velocity at both ends.
-            length, half = cell.length, 0.5 * cell.length
+            length = cell.length
+            half = 0.5 * cell.length
             # Not `reached - x`: its rounding, over a short length twice, would put motors that run
             # in step out of it.
-            gained, moved = arrives - v, gone - v * length
+            gained = arrives - v
+            moved = gone - v * length
             first = 4.0 * moved / length**2 - gained / length
             second = 3.0 * gained / length - 4.0 * moved / length**2
             pieces.append(Piece(cell.start, x, v, first))
             middle = x + half * (v + 0.5 * first * half)
             pieces.append(Piece(cell.start + half, middle, v + first * half, second))
-        end, target = cell.start + cell.length, reached
+        end = cell.start + cell.length
+        target = reached
     while pieces and pieces[-1].velocity == 0.0 and pieces[-1].acceleration == 0.0:
         pieces.pop()
     if not pieces or end == now:

@@ -73,7 +73,9 @@ class Drive:
         """Return the start of the trajectory after the one in force [s]; inf if there is
         none."""
         index = self._index(now) + 1
-        return self._starts[index] if index < len(self._starts) else math.inf
+        if index < len(self._starts):
+            return self._starts[index]
+        return math.inf
 
     @property
     def end(self) -> float:
@@ -90,7 +92,9 @@ class Drive:
         left = self.trajectories[self._index(now) :]
         if self.origin:
             left = tuple(leg.shifted(self.origin) for leg in left)
-        return left[0] if len(left) == 1 else motion.joined(left)
+        if len(left) == 1:
+            return left[0]
+        return motion.joined(left)
 
     def following(self, *trajectories: Trajectory, origin: float = 0.0) -> Drive:
         """Make the same motor follow `trajectories` alone."""
@@ -186,7 +190,8 @@ def plan_jog(
 
     def run(name: str, lease: float) -> Trajectory:
         """Plan a motor's share: it runs for `lease` [s], or as far as its limit."""
-        axis, current = machine.axes[name], drives[name].at(now)
+        axis = machine.axes[name]
+        current = drives[name].at(now)
         wanted = velocity * moves[name]
         acceleration = max(pace[name][1], current.acceleration(now))
         here = current.position(now), current.velocity(now)
@@ -199,7 +204,8 @@ def plan_jog(
     # Coupled motors brake together, when the first of them has to brake for its limit.
     lease = lease_s
     for name in moves:
-        planned, axis_of = run(name, lease_s), machine.axes[name]
+        planned = run(name, lease_s)
+        axis_of = machine.axes[name]
         if planned.target in (axis_of.lower, axis_of.upper):
             lease = max(0.0, min(lease, planned.pieces[-1].start - now))
     return {name: run(name, lease) for name in moves}
@@ -231,8 +237,9 @@ def with_settings(
     out = dict(drives)
     shares = {name: abs(factor) for name, factor in machine.moves(axis).items()}
     asked: tuple[tuple[Rate, float | None], ...] = (
-        ("speed", speed), ("acceleration", acceleration),
-    )  # fmt: skip
+        ("speed", speed),
+        ("acceleration", acceleration),
+    )
     for what, value in asked:
         if value is None:
             continue
@@ -247,7 +254,8 @@ def with_settings(
             {"axis": axis, "setting": what, "asked": value, "allowed": [low, high]},
         )
     for name, share in shares.items():
-        drive, most = drives[name], machine.axes[name]
+        drive = drives[name]
+        most = machine.axes[name]
         out[name] = replace(
             drive,
             speed=drive.speed if speed is None else min(speed * share, most.max_speed),
@@ -292,4 +300,6 @@ def _shortest(axis: Axis, position: float, target: float) -> float:
     # The nearest may lie past the travel's end: then the next one inwards is the shortest allowed.
     candidates = [target + 360.0 * (turns + more) for more in (0, -1, 1)]
     allowed = [c for c in candidates if axis.lower <= c <= axis.upper]
-    return min(allowed, key=lambda c: abs(c - position)) if allowed else target
+    if allowed:
+        return min(allowed, key=lambda c: abs(c - position))
+    return target

@@ -82,7 +82,9 @@ class Trajectory:
         """Compute the position at `time` [s]."""
         piece = self._piece(time)
         if piece is None:
-            return self.target if time >= self.end else self.pieces[0].position
+            if time >= self.end:
+                return self.target
+            return self.pieces[0].position
         dt = time - piece.start
         return piece.position + dt * (piece.velocity + 0.5 * piece.acceleration * dt)
 
@@ -113,7 +115,8 @@ class Trajectory:
         index = bisect_right(self.knots, time, hi=len(self.pieces)) - 1
         piece = self.pieces[index]
         until = self.knots[index + 1] if index + 1 < len(self.knots) else self.end
-        velocity, a = piece.velocity + piece.acceleration * (time - piece.start), piece.acceleration
+        velocity = piece.velocity + piece.acceleration * (time - piece.start)
+        a = piece.acceleration
         if velocity * a < 0.0:
             turns = -velocity / a
             if turns <= TIME_ROUNDING_S:
@@ -164,7 +167,9 @@ class Trajectory:
             if dt is not None and piece.start + dt <= stop + 1e-9 + 4.0 * math.ulp(stop):
                 return min(piece.start + dt, stop)
         # A position that rounding puts a hair past the target is the target.
-        return self.end if abs(position - self.target) <= 1e-9 else None
+        if abs(position - self.target) <= 1e-9:
+            return self.end
+        return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -381,7 +386,9 @@ class _Builder:
 
     def __init__(self, time: float, position: float, velocity: float) -> None:
         self.begin = (time, position, velocity)
-        self.time, self.position, self.velocity = time, position, velocity
+        self.time = time
+        self.position = position
+        self.velocity = velocity
         self.pieces: list[Piece] = []
 
     def _add(self, dt: float, acceleration: float) -> None:
@@ -413,7 +420,9 @@ def _first_root(a: float, b: float, c: float) -> float | None:
     if c == 0.0:
         return 0.0
     if a == 0.0:
-        return -c / b if b != 0.0 and -c / b >= 0 else None
+        if b != 0.0 and -c / b >= 0:
+            return -c / b
+        return None
     discriminant = b * b - 4 * a * c
     if discriminant < 0:
         # A parabola that only just touches (the end of a ramp at the target) may round below zero.

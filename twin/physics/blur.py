@@ -88,7 +88,8 @@ def blurred(
         return image
     import cv2
 
-    u, v = weights(sigma_px), weights(across)
+    u = weights(sigma_px)
+    v = weights(across)
     out = cv2.sepFilter2D(image, cv2.CV_32F, u, v, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(out, dtype=np.float32)
 
@@ -102,9 +103,13 @@ def spot_blur_px(view: FloatArray, spot_mm: float, towards_mm: float = 0.0) -> f
         spot_mm: focal spot, full width at half maximum [mm].
         towards_mm: distance from the axis towards the source [mm].
     """
-    source, centre, u, v = view[0:3], view[3:6], view[6:9], view[9:12]
+    source = view[0:3]
+    centre = view[3:6]
+    u = view[6:9]
+    v = view[9:12]
     normal = np.cross(u, v)
-    to_axis, to_panel = float(-source @ normal), float((centre - source) @ normal)
+    to_axis = float(-source @ normal)
+    to_panel = float((centre - source) @ normal)
     near = to_axis - towards_mm * float(np.linalg.norm(normal))
     magnification = to_panel / (max(near, 1e-3 * to_axis) or 1e-300)
     return max(0.0, magnification - 1.0) * spot_mm / FWHM / float(np.linalg.norm(u))

@@ -1,10 +1,10 @@
-"""The whole chain for one image: path lengths through materials to the electrons that are expected.
+"""The chain for one image: path lengths through materials to the electrons that are expected.
 
-There are two steps, so that the second can depend on earlier frames: `radiographs` are free of
-noise and depend on geometry, tube and sample; `readout.read_out` adds what the panel does.
-Scattered radiation is `flexdt.twin.physics.scatter`'s. The twin server and `flexdt.simulate` both
-make images with these functions, so a simulated data set and a scan of the twin differ in nothing
-but their geometry.
+There are two steps, so that the second can depend on earlier frames: `radiographs` are
+free of noise and depend on geometry, tube and sample; `readout.read_out` adds the panel's
+effects. Scattered radiation is `flexdt.twin.physics.scatter`'s. The twin server and
+`flexdt.simulate` both make images with these functions, so a simulated data set and a
+scan of the twin differ in nothing but their geometry.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ class Chain:
         tube: the source.
         substances: of the sample, in the order of the path lengths.
         thickest_mm: longest path through each [mm]; effective energies hold up to there.
-        mono_keV: all photons have this energy, as many as give the spectrum's open-beam signal;
-            None for the whole spectrum.
+        mono_keV: all photons have this energy, as many as give the spectrum's open-beam
+            signal; None for the full spectrum.
     """
 
     panel: Detector
@@ -118,7 +118,8 @@ def expected_signal(
     count = paths_mm.shape[1] if paths_mm.ndim == 4 else 1
     moments = paths_mm.reshape(len(chain.substances), count, *shape)
     mean, variance = beam_of(chain, exposure.kV).transmit(moments)
-    one, spread = mean.mean(axis=0), variance.mean(axis=0)
+    one = mean.mean(axis=0)
+    spread = variance.mean(axis=0)
     spot = spot_blur_px(row, chain.tube.focal_spot_mm(exposure.power_W))
     across = spot * float(np.linalg.norm(row[6:9]) / np.linalg.norm(row[9:12]))
     flux = flux_of(row, shape) * np.float32(mAs(exposure))
@@ -134,8 +135,11 @@ def flux_of(view: npt.ArrayLike, shape: tuple[int, int]) -> Float32Array:
     """Compute `flux_map` of a cone_vec row (12,): the open pixel's share of the charge at
     1 m, per cm2."""
     row = np.asarray(view, dtype=np.float64)
-    away, u, v = row[0:3] - row[3:6], row[6:9], row[9:12]
-    pixel_u, pixel_v = float(np.linalg.norm(u)), float(np.linalg.norm(v))
+    away = row[0:3] - row[3:6]
+    u = row[6:9]
+    v = row[9:12]
+    pixel_u = float(np.linalg.norm(u))
+    pixel_v = float(np.linalg.norm(v))
     normal = np.cross(u, v) / (pixel_u * pixel_v)
     feet = float(away @ u) / pixel_u, float(away @ v) / pixel_v
     # Rounded, so that equal views share a map.
@@ -145,9 +149,13 @@ def flux_of(view: npt.ArrayLike, shape: tuple[int, int]) -> Float32Array:
 
 @lru_cache(maxsize=16)
 def flux_map(
-    distance: float, foot_u: float, foot_v: float, pixel_u: float, pixel_v: float,
+    distance: float,
+    foot_u: float,
+    foot_v: float,
+    pixel_u: float,
+    pixel_v: float,
     shape: tuple[int, int],
-) -> Float32Array:  # fmt: skip
+) -> Float32Array:
     """Compute pixel area [cm2] times inverse square of the distance relative to 1 m,
     times the obliquity.
 
@@ -207,8 +215,8 @@ class Radiograph:
     """The noise-free effect of the X-rays of one pose on the panel.
 
     Attributes:
-        integrals: (rows, cols), or (moments, rows, cols): what a logarithm of the
-            flat-corrected image would show.
+        integrals: (rows, cols), or (moments, rows, cols): line integrals of the
+            flat-corrected image.
         expected: electrons with the tube on; None in ideal physics.
     """
 

@@ -172,10 +172,16 @@ class Detector:
             True
         """
         nothing = dict.fromkeys(
-            ("read_noise_e", "dark_e_per_s", "blur_mm", "gain_sigma", "offset_sigma_counts",
-             "dead_fraction"),
+            (
+                "read_noise_e",
+                "dark_e_per_s",
+                "blur_mm",
+                "gain_sigma",
+                "offset_sigma_counts",
+                "dead_fraction",
+            ),
             0.0,
-        )  # fmt: skip
+        )
         all_of_it = ((0.1, 0.1), (1e4, 1e4))
         return cls(**{"swank": 1.0, "response": all_of_it, **nothing, **figures})
 
@@ -196,7 +202,8 @@ class Detector:
         across, up = pixels.edges_mm
         # In pixels of the twin as it is usually read out, binned 2 x.
         area = across * up / (2 * PixelGrid.pitch_mm) ** 2
-        gain, dark = self.electrons_per_count, self.dark_e_per_s
+        gain = self.electrons_per_count
+        dark = self.dark_e_per_s
         return replace(
             self,
             pixels=pixels,
@@ -314,7 +321,8 @@ class Detector:
         energy = tables().energy_keV
         if self.response:
             # What one photon leaves is spread as computed, for want of another measurement.
-            spread, points = square / part, np.array([(0.0, 0.0), *self.response])
+            spread = square / part
+            points = np.array([(0.0, 0.0), *self.response])
             part = np.interp(energy, *points.T) / energy
             square = part * np.maximum(spread, part)
         charge = energy * self.electrons_per_keV
@@ -330,9 +338,12 @@ def _is_low(camera: CameraSettings) -> bool:
 def detector_of(spec: DetectorSpec) -> Detector:
     """Make the detector of a machine: its own pixels and depth, the default's other figures."""
     return Detector(
-        pixels=spec.pixels, bits=spec.bits, long_lag_fraction=spec.long_lag_fraction,
-        long_lag_s=spec.long_lag_s, response=spec.response,
-    )  # fmt: skip
+        pixels=spec.pixels,
+        bits=spec.bits,
+        long_lag_fraction=spec.long_lag_fraction,
+        long_lag_s=spec.long_lag_s,
+        response=spec.response,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -363,7 +374,8 @@ def pattern(panel: Detector, binning: int, roi: tuple[int, int, int, int]) -> Pa
     alive = rng.random(shape, dtype=np.float32) >= panel.dead_fraction
     b = binning
     left, top, right, bottom = roi
-    rows, cols = (bottom - top + 1) // b, (right - left + 1) // b
+    rows = (bottom - top + 1) // b
+    cols = (right - left + 1) // b
 
     def blocks(values: npt.NDArray[np.float32]) -> Float32Array:
         """Average the unbinned pixels of each image pixel."""

@@ -75,7 +75,8 @@ class ExposureSettings:
 def ideal_response(machine: Machine) -> IdealResponse:
     """Make the response of `machine`: at its own settings an open beam fills 3/4 of its
     depth."""
-    model, tube = IdealResponse(), machine.tube
+    model = IdealResponse()
+    tube = machine.tube
     scale = 2.0 ** (machine.detector.bits - model.bits)
     return IdealResponse(
         bits=machine.detector.bits,

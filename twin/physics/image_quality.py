@@ -84,7 +84,8 @@ def pixel_reading(
     for substance, path in layers:
         depth += substance.attenuation() * path
     through = np.exp(-depth)
-    scale, panel = mAs(exposure) * flux, chain.panel
+    scale = mAs(exposure) * flux
+    panel = chain.panel
     variance = pixel_variance(panel, camera, exposure.averages, float(noise @ through) * scale)
     return PixelValue(
         expected_counts(panel, camera, float(signal @ through) * scale), math.sqrt(variance)

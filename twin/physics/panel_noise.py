@@ -67,7 +67,9 @@ def draw_quanta(exposed: Exposed, rng: np.random.Generator) -> Float32Array:
 
     Gaussian for many quanta; for few, whole quanta of the size that gives the variance.
     """
-    mean, variance, averages = exposed.mean_e, exposed.variance_e, exposed.averages
+    mean = exposed.mean_e
+    variance = exposed.variance_e
+    averages = exposed.averages
     out = rng.standard_normal(mean.shape, dtype=np.float32)
     out *= np.sqrt(variance * np.float32(1.0 / averages))
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):

@@ -185,7 +185,8 @@ def proposed_setting(machine: Machine, exposure: ExposureSettings, beam: OpenBea
     """
     if beam.counts <= 0.0:
         return "a higher voltage"
-    spec, tube = machine.detector, machine.tube
+    spec = machine.detector
+    tube = machine.tube
     factor = BRIGHTEST_FILL / beam.fill
     power_W = exposure.power_W
     if factor > 1.0:  # more power costs no time
@@ -196,4 +197,6 @@ def proposed_setting(machine: Machine, exposure: ExposureSettings, beam: OpenBea
     words = f"{nearest_ms:.3g} ms at {power_W:.3g} W"
     if time_ms > spec.max_exposure_ms:
         return f"not even {words}"
-    return words if power_W != exposure.power_W else f"{nearest_ms:.3g} ms"
+    if power_W != exposure.power_W:
+        return words
+    return f"{nearest_ms:.3g} ms"

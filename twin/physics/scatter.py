@@ -203,7 +203,10 @@ def scatter_image(
 
     wanted = ScatterSettings() if settings is None else settings
     row = np.asarray(view, dtype=np.float64)
-    source, centre, u, v = row[0:3], row[3:6], row[6:9], row[9:12]
+    source = row[0:3]
+    centre = row[3:6]
+    u = row[6:9]
+    v = row[9:12]
     rows, cols = shape
     nv, nu = _node_counts(shape, float(np.linalg.norm(v) / np.linalg.norm(u)), wanted.nodes)
     sections = cross_sections(thing.substances)
@@ -219,7 +222,8 @@ def scatter_image(
     lit = _lit(thing, row, shape, wanted.collimated) if there else (0.0, 0.0, 0.0, 0.0)
     left, top, right, bottom = lit
     corner = centre + left * u + top * v
-    along_u, along_v = (right - left) * u, (bottom - top) * v
+    along_u = (right - left) * u
+    along_v = (bottom - top) * v
     area = float(np.linalg.norm(np.cross(along_u, along_v)))
     if not area > 0.0:
         blank = np.zeros((nv, nu))
@@ -235,18 +239,44 @@ def scatter_image(
     tallies = np.zeros((BATCHES, kernels.TALLIES))
     lower, _ = thing.corners
     step = float(sections.energy_keV[1] - sections.energy_keV[0])
-    done, fans = 0, np.array([nv * nu, max(1, nv * nu // LATER_FAN)])
+    done = 0
+    fans = np.array([nv * nu, max(1, nv * nu // LATER_FAN)])
     each = FIRST_HISTORIES
     while True:
         kernels.histories(
-            np.stack([one.random(each) for one in sequences]), done, keys, fans,
-            kernels.MAX_ORDERS, source, corner, along_u, along_v, normal, area,
-            nodes, per_open, thing.amounts, lower, np.array(thing.voxel_mm, dtype=np.float64),
-            float(sections.energy_keV[0]), step, sections.total, sections.coherent,
-            sections.incoherent, sections.root_step, sections.form, sections.shell,
-            sections.cumulated, bins, np.cumsum(chance) / chance.sum(),
-            share / beam.response[bins] / chance, beam.response, beam.spread, images, tallies,
-        )  # fmt: skip
+            np.stack([one.random(each) for one in sequences]),
+            done,
+            keys,
+            fans,
+            kernels.MAX_ORDERS,
+            source,
+            corner,
+            along_u,
+            along_v,
+            normal,
+            area,
+            nodes,
+            per_open,
+            thing.amounts,
+            lower,
+            np.array(thing.voxel_mm, dtype=np.float64),
+            float(sections.energy_keV[0]),
+            step,
+            sections.total,
+            sections.coherent,
+            sections.incoherent,
+            sections.root_step,
+            sections.form,
+            sections.shell,
+            sections.cumulated,
+            bins,
+            np.cumsum(chance) / chance.sum(),
+            share / beam.response[bins] / chance,
+            beam.response,
+            beam.spread,
+            images,
+            tallies,
+        )
         done += each
         batches = images[:, :, :2].sum(axis=2) / done
         mean = batches.mean(axis=0)
@@ -284,7 +314,8 @@ def _energy_chances(
 def _node_counts(shape: tuple[int, int], aspect: float, nodes: int) -> tuple[int, int]:
     """Choose the numbers of nodes along rows and columns, evenly spaced, two at least and
     a pixel apart at most."""
-    height, width = max(shape[0] - 1, 1) * aspect, max(shape[1] - 1, 1)
+    height = max(shape[0] - 1, 1) * aspect
+    width = max(shape[1] - 1, 1)
     nv = round(np.sqrt(nodes * height / width))
     nu = round(np.sqrt(nodes * width / height))
     return min(max(nv, 2), max(shape[0], 2)), min(max(nu, 2), max(shape[1], 2))
@@ -295,7 +326,10 @@ def _lit(
 ) -> tuple[float, float, float, float]:
     """Project the object's box on the panel's plane: least column and row, greatest, from
     its centre."""
-    source, centre, u, v = row[0:3], row[3:6], row[6:9], row[9:12]
+    source = row[0:3]
+    centre = row[3:6]
+    u = row[6:9]
+    v = row[9:12]
     box = np.array(thing.corners)
     corners = np.array([[box[i, 0], box[j, 1], box[k, 2]] for i, j, k in np.ndindex(2, 2, 2)])
     normal = np.cross(u, v)
@@ -305,10 +339,12 @@ def _lit(
         raise GeometryError.instead(said, source.tolist(), "a sample in front of the source")
     on_panel = source + (corners - source) / depth[:, None] - centre
     plane = np.linalg.lstsq(np.stack([u, v], axis=1), on_panel.T, rcond=None)[0]
-    low, high = plane.min(axis=1), plane.max(axis=1)
+    low = plane.min(axis=1)
+    high = plane.max(axis=1)
     if collimated:
         edge = np.array([shape[1], shape[0]]) / 2.0
-        low, high = np.maximum(low, -edge), np.minimum(high, edge)
+        low = np.maximum(low, -edge)
+        high = np.minimum(high, edge)
     high = np.maximum(high, low)
     return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
@@ -382,7 +418,8 @@ class ScanScatter:
         """
         if not -len(self) <= index < len(self):
             raise IndexError(f"view {index} of {len(self)}")
-        place, known = self.way[index], self.known
+        place = self.way[index]
+        known = self.known
         after = min(int(np.searchsorted(known, place)), len(known) - 1)
         before = max(after - 1, 0)
         span = known[after] - known[before]
@@ -450,7 +487,9 @@ def scan_scatter(
 def way_of(rows: FloatArray) -> FloatArray:
     """Compute the path length of source and panel up to each view, relative to their
     distances, (n,) [rad]."""
-    source, centre, frame = rows[:, 0:3], rows[:, 3:6], rows[:, 6:12]
+    source = rows[:, 0:3]
+    centre = rows[:, 3:6]
+    frame = rows[:, 6:12]
     scales = (
         np.linalg.norm(source, axis=1).min(),
         np.linalg.norm(centre - source, axis=1).min(),

@@ -59,11 +59,14 @@ def deposited(screen: Filter) -> Deposited:
     """
     from scipy.special import expn
 
-    substance, thick = screen.substance, screen.thickness_mm
+    substance = screen.substance
+    thick = screen.thickness_mm
     if thick <= 0.0:
         return Deposited(*np.zeros((2, len(tables().energy_keV))))
-    sections, energy = cross_sections((substance,)), tables().energy_keV
-    total, compton = sections.total[0], sections.incoherent[0]
+    sections = cross_sections((substance,))
+    energy = tables().energy_keV
+    total = sections.total[0]
+    compton = sections.incoherent[0]
     stopping = total - sections.coherent[0]
     photo = stopping - compton
     stopped = -np.expm1(-stopping * thick)

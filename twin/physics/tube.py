@@ -169,7 +169,8 @@ def monochromatic(energy_keV: float) -> Spectrum:
     """
     energy = tables().energy_keV
     step = float(energy[1] - energy[0])
-    low, high = float(energy[0]) - step / 2, float(energy[-1]) + step / 2
+    low = float(energy[0]) - step / 2
+    high = float(energy[-1]) + step / 2
     require_within("the energy of photons", energy_keV, low, high, "keV")
     fluence = np.zeros_like(energy)
     fluence[min(int((energy_keV - low) / step), len(fluence) - 1)] = 1.0

@@ -227,7 +227,9 @@ class Lookahead:
         acceleration = max(planned.acceleration(self.now), motion.MIN_RATE)
         way = current.redirected(contact.last_free[name], speed, acceleration, self.now)
         halted = {name: way}
-        return halted if self.contact(halted) is None else None
+        if self.contact(halted) is None:
+            return halted
+        return None
 
     def _halt_along(self, new: Trajectories, contact: Contact) -> dict[str, Trajectory] | None:
         """Slow `new` along its path as late as possible; the path is free up to the contact."""
@@ -238,11 +240,9 @@ class Lookahead:
             return programme_time_at_rest(moving, at, self.hardest) <= contact.last_free_time
 
         at = self._latest(rests_in_time, contact, HALVINGS)
-        return (
-            None
-            if at is None
-            else _trajectories(braked_at(self.drives, at, new, self.hardest), new)
-        )
+        if at is None:
+            return None
+        return _trajectories(braked_at(self.drives, at, new, self.hardest), new)
 
     def _new_halt_swept(self, new: Trajectories, contact: Contact) -> dict[str, Trajectory] | None:
         """Slow `new` by itself as late as possible while the others carry on."""
@@ -269,14 +269,16 @@ class Lookahead:
 
         First ever farther back from the contact, then bisection.
         """
-        late, back = contact.last_free_time, FIRST_LEAD_S
+        late = contact.last_free_time
+        back = FIRST_LEAD_S
         while True:
             early = max(self.now, contact.last_free_time - back)
             if holds(early):
                 break
             if early == self.now:
                 return None
-            late, back = early, 2.0 * back
+            late = early
+            back = 2.0 * back
         for _ in range(halvings):
             middle = 0.5 * (early + late)
             if holds(middle):
@@ -463,7 +465,8 @@ class StageChange:
         Raises:
             SafetyError: a long programme has begun meanwhile; nothing changes.
         """
-        still, found = before.version == self.version and not self.moves, before.found
+        still = before.version == self.version and not self.moves
+        found = before.found
         if still and found is not None and found.contact is None:
             return Joined({})  # what was free to its end is so still
         if self.ahead.legs <= MAX_SWEPT_LEGS:
@@ -478,7 +481,8 @@ class StageChange:
     def verdict(self) -> Joined:
         """Judge whether what is under way may carry on, or how it is halted; raises as
         `certified`."""
-        changed, now = self.ahead.on(self.guard), self.ahead.now
+        changed = self.ahead.on(self.guard)
+        now = self.ahead.now
         under_way = self.ahead.ahead()
         self._require_no_nearer(changed)
         contact = changed.contact(under_way) if under_way else None
@@ -523,6 +527,12 @@ class StageChange:
             what += f" with correction {self.correction.name!r}"
         allowed = "a pose at which it is free, or another placement"
         return would_touch(
-            what, pair, seconds, last_free, "would be too close", "nothing changes",
-            halts_at={}, allowed=allowed,
-        )  # fmt: skip
+            what,
+            pair,
+            seconds,
+            last_free,
+            "would be too close",
+            "nothing changes",
+            halts_at={},
+            allowed=allowed,
+        )

@@ -129,7 +129,9 @@ def after_contact(safety: Safety, contact: Contact) -> Safety:
 
 def after_free_motion(safety: Safety) -> Safety:
     """Clear the count of blocked attempts after a motion that went through."""
-    return replace(safety, blocked_attempts=0) if safety.blocked_attempts else safety
+    if safety.blocked_attempts:
+        return replace(safety, blocked_attempts=0)
+    return safety
 
 
 def estopped(safety: Safety, by: str) -> Safety:
@@ -159,7 +161,9 @@ def released(safety: Safety, stop: int | None) -> Safety:
             {"asked": stop, "allowed": safety.stop, "state": safety.state, "reason": safety.reason},
         )
     ready = replace(safety, state="ready", blocked_attempts=0, reason="", stopped_by="")
-    return ready if safety.contact is None else in_contact(ready, safety.contact)
+    if safety.contact is None:
+        return ready
+    return in_contact(ready, safety.contact)
 
 
 def in_contact(safety: Safety, pair: tuple[str, str] | None) -> Safety:
@@ -172,7 +176,9 @@ def in_contact(safety: Safety, pair: tuple[str, str] | None) -> Safety:
             return safety
         reason = "parts were in contact and have come apart"
         apart = replace(safety, contact=None)
-        return apart if safety.state == "estopped" else replace(apart, reason=reason)
+        if safety.state == "estopped":
+            return apart
+        return replace(apart, reason=reason)
     touching = replace(safety, contact=pair)
     if safety.state == "estopped":
         return touching
@@ -197,18 +203,31 @@ def collision_error(
     ahead = contact.time - now
     where = ", ".join(f"{axis} {value:.4g}" for axis, value in halts_at.items())
     outcome = f"motion halts at {where}" if where else "nothing changes"
-    count, most = safety.blocked_attempts, safety.max_blocked_attempts
+    count = safety.blocked_attempts
+    most = safety.max_blocked_attempts
     return would_touch(
-        what, contact.pair, ahead, contact.last_free, "are too close already",
-        f"{outcome} (blocked attempt {count} of {most})", halts_at=dict(halts_at),
-        blocked_attempts=count, max_blocked_attempts=most, state=safety.state,
-    )  # fmt: skip
+        what,
+        contact.pair,
+        ahead,
+        contact.last_free,
+        "are too close already",
+        f"{outcome} (blocked attempt {count} of {most})",
+        halts_at=dict(halts_at),
+        blocked_attempts=count,
+        max_blocked_attempts=most,
+        state=safety.state,
+    )
 
 
 def would_touch(
-    what: str, pair: tuple[str, str], ahead: float, last_free: Mapping[str, float], near: str,
-    outcome: str, **data: object,
-) -> CollisionError:  # fmt: skip
+    what: str,
+    pair: tuple[str, str],
+    ahead: float,
+    last_free: Mapping[str, float],
+    near: str,
+    outcome: str,
+    **data: object,
+) -> CollisionError:
     """Make the error for a command after which two parts meet, or are too near.
 
     Args:

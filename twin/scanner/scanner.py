@@ -153,7 +153,9 @@ class ScannerTwin:
     @property
     def parameters(self) -> Offsets:
         """The correction in force, as offsets; all nominal when there is none."""
-        return NOMINAL if self.correction is None else self.correction.parameters
+        if self.correction is None:
+            return NOMINAL
+        return self.correction.parameters
 
     @property
     def pixel_mm(self) -> float:
@@ -510,9 +512,13 @@ class ScannerTwin:
                 "motion was stopped meanwhile; nothing changes", {"allowed": "asking again"}
             )
         anew = self.stage_change(
-            change.sample, change.correction, change.guard, now,
-            targets=change.targets, paces=change.paces,
-        )  # fmt: skip
+            change.sample,
+            change.correction,
+            change.guard,
+            now,
+            targets=change.targets,
+            paces=change.paces,
+        )
         verdict = anew.renewed(change)
         for name, (speed, acceleration) in change.paces.items():
             self._drives = plan.with_settings(self.machine, self._drives, name, speed, acceleration)
@@ -520,7 +526,8 @@ class ScannerTwin:
         if anew.moves:
             self._take(anew.moves)
         self.safety = self._safety_at(now)
-        contact, halted = verdict.contact, verdict.trajectories
+        contact = verdict.contact
+        halted = verdict.trajectories
         if contact is None:
             return None
         # Also when that was once too often: another stop would not be certified on this stage.
@@ -551,7 +558,9 @@ class ScannerTwin:
         self._set_stage(sample, correction, guard)
         self.safety = in_contact(self.safety, self._touching(now))
         pair = self.safety.contact
-        return [] if pair is None else [f"{pair[0]} and {pair[1]} are closer than the margin"]
+        if pair is None:
+            return []
+        return [f"{pair[0]} and {pair[1]} are closer than the margin"]
 
     def require_applicable(self, correction: NamedCorrection | None) -> None:
         """Check that a correction leaves a geometry that a scanner can have.
@@ -630,7 +639,9 @@ class ScannerTwin:
         self, sample: Sample, correction: NamedCorrection | None, guard: Guard | None
     ) -> None:
         """Set sample, correction and guard, and count the change."""
-        self.sample, self.correction, self.guard = sample, correction, guard
+        self.sample = sample
+        self.correction = correction
+        self.guard = guard
         self._stage += 1
 
     def _lookahead(self, now: float) -> Lookahead:
@@ -691,7 +702,8 @@ class ScannerTwin:
 
     def _axis_state(self, name: str, now: float) -> AxisReading:
         """Read a motor."""
-        axis, drive = self.machine.axes[name], self._drives[name]
+        axis = self.machine.axes[name]
+        drive = self._drives[name]
         t = drive.at(now)
         return AxisReading(
             position=t.position(now),

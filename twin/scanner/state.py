@@ -69,7 +69,9 @@ class TubeSettings:
 
     def ready_in_s(self, now: float) -> float | None:
         """Return the time until they are [s]; None while the tube is off."""
-        return max(0.0, self.ready_at - now) if self.on else None
+        if self.on:
+            return max(0.0, self.ready_at - now)
+        return None
 
 
 @dataclass(frozen=True)
@@ -300,7 +302,8 @@ def switched(
         return tube
     if not on:
         return replace(tube, on=False, since=now)
-    timing, spec = machine.timing, machine.tube
+    timing = machine.timing
+    spec = machine.tube
     rested = now - tube.since > spec.cold_after_s
     takes = timing.xrayon_s + timing.xray_ready_s
     if rested and not warm:
@@ -316,7 +319,8 @@ def changed_tube(
     Raises:
         LimitError: outside the tube's range; the message names the setting.
     """
-    kV, power_W = tube.kV if kV is None else kV, tube.power_W if power_W is None else power_W
+    kV = tube.kV if kV is None else kV
+    power_W = tube.power_W if power_W is None else power_W
     new = replace(tube, kV=kV, power_W=power_W)
     _require_within("tube", "kV", new.kV, spec.min_kV, spec.max_kV)
     _require_within("tube", "power_W", new.power_W, 0.0, spec.max_W)
@@ -335,7 +339,8 @@ def changed_camera(
     new = replace(camera, **stated)
     spec.check_mode(new.mode)
     check_roi(new.roi, spec.pixels, new.binning)
-    least, most = spec.min_exposure_ms, spec.max_exposure_ms
+    least = spec.min_exposure_ms
+    most = spec.max_exposure_ms
     _require_within("camera", "exposure_ms", new.exposure_ms, least, most)
     _require_within("camera", "averages", new.averages, 1, 10_000)
     _require_within("camera", "frames", new.frames, 1, 1_000_000)

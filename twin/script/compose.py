@@ -56,7 +56,8 @@ def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> 
     Returns:
         TAB separated lines with CRLF, as `parse_script` reads them.
     """
-    panel, tube = machine.detector, machine.tube
+    panel = machine.detector
+    tube = machine.tube
     exposure = panel.exposure_ms if request.exposure_ms is None else request.exposure_ms
     change: CameraChange = {"mode": request.mode, "roi": request.roi, "exposure_ms": exposure}
     changed_camera(panel, panel.camera, change)
@@ -64,8 +65,16 @@ def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> 
     attempts = list(_usual(request, MotorTargets(machine, profile)))
     for sod, sdd, height in attempts:
         placed = (ScanPosition(sod),) if request.placements is None else request.placements
-        full = _Request(**{**vars(request), "sod_mm": sod, "sdd_mm": sdd, "height_mm": height,
-                           "exposure_ms": exposure, "placements": placed})  # fmt: skip
+        full = _Request(
+            **{
+                **vars(request),
+                "sod_mm": sod,
+                "sdd_mm": sdd,
+                "height_mm": height,
+                "exposure_ms": exposure,
+                "placements": placed,
+            }
+        )
         try:
             _check_counts(full)
             writer = _Writer(machine, profile, full)
@@ -90,7 +99,9 @@ def _usual(request: ScanRequest, places: MotorTargets) -> Iterator[tuple[float, 
     home [mm]."""
 
     def tried(asked: float | None, *usual: float) -> Iterable[float]:
-        return dict.fromkeys(usual) if asked is None else (asked,)
+        if asked is None:
+            return dict.fromkeys(usual)
+        return (asked,)
 
     home = places.at_home
     height = home("object_z" if places.has("source_z") else "source_z")
@@ -127,14 +138,20 @@ class _Writer(MotorTargets):
         yield from self.settings()
         yield from self.moves(self.station(w.sod_mm) | out)
         yield from self.references()
-        kinds = {"fly": self.fly, "step": self.step, "tiled": self.tiled, "helical": self.helical,
-                 "calibration": self.calibration}  # fmt: skip
+        kinds = {
+            "fly": self.fly,
+            "step": self.step,
+            "tiled": self.tiled,
+            "helical": self.helical,
+            "calibration": self.calibration,
+        }
         yield from kinds[w.kind]()
         yield _row("tube", "xrayoff")
 
     def settings(self) -> Iterator[str]:
         """Yield the rows that set tube and camera."""
-        w, m = self.request, self.machine
+        w = self.request
+        m = self.machine
         camera = self.camera
         yield _row("tube", "set kV", _f(m.tube.kV if w.kV is None else w.kV))
         yield _row("tube", "set power", _f(m.tube.power_W if w.power_W is None else w.power_W))
@@ -174,7 +191,8 @@ class _Writer(MotorTargets):
 
     def tiled(self) -> Iterator[str]:
         """Yield smooth turns with the detector side by side; neighbours share a tenth."""
-        w, camera = self.request, self.camera
+        w = self.request
+        camera = self.camera
         self.need("a tiled scan", "detector_x")
         width = camera.shape[1] * camera.pixel_mm(self.machine.detector.pixels)
         for k in range(w.tiles):
@@ -199,7 +217,8 @@ class _Writer(MotorTargets):
         Raises:
             LimitError: no motors for it, or a rise that is too fast for the run-up.
         """
-        w, m = self.request, self.machine
+        w = self.request
+        m = self.machine
         name, rotation = self.rotation
         total = 360.0 * w.turns
         speed = self.turn_speed(total, w.frames)
@@ -226,7 +245,8 @@ class _Writer(MotorTargets):
                 what = "raises or lowers with motors that move something else too, so flexdt writes"
                 axes = list(m.geometry[quantity])
                 raise self.lacking(f"{what} no helical scan for it", asked="helical", axes=axes)
-            at, factor = station[motor], m.geometry[quantity][motor]
+            at = station[motor]
+            factor = m.geometry[quantity][motor]
             axis = m.axis(motor)
             pace = rise_speed / abs(factor)
             if pace > axis.max_speed or pace / axis.acceleration > lead_s:
@@ -395,9 +415,12 @@ class _Writer(MotorTargets):
     @property
     def camera(self) -> CameraSettings:
         """Camera settings of the request, else the machine's."""
-        w, camera = self.request, self.machine.detector.camera
+        w = self.request
+        camera = self.machine.detector.camera
         camera = camera if w.mode is None else replace(camera, mode=w.mode)
-        return camera if w.roi is None else replace(camera, roi=w.roi)
+        if w.roi is None:
+            return camera
+        return replace(camera, roi=w.roi)
 
     @property
     def region(self) -> FloatArray:

@@ -61,7 +61,9 @@ def check_script(
     """
     problems: tuple[ScriptProblem, ...]
     if isinstance(text, c.Script):
-        script, problems, shown = text, text.warnings, ""
+        script = text
+        problems = text.warnings
+        shown = ""
     else:
         text = content(text)
         script, problems = read_script(text)
@@ -128,7 +130,8 @@ def _start_problems(plan: ScanPlan) -> list[ScriptProblem]:
 def _optics(view: View) -> Optics:
     """Describe what the images of a view show: distances, magnification, field and
     truncation."""
-    p, camera = view.poses, view.camera
+    p = view.poses
+    camera = view.camera
     rows, cols = shape = camera.shape
     pixel = float(np.linalg.norm(p.u[0]))
     m = p.sdd / p.sod
@@ -167,7 +170,8 @@ def _truncation_problems(seen: Sequence[View]) -> list[ScriptProblem]:
     for view in seen:
         if view.outside.all() or not (view.right > view.left).any():
             continue
-        names, cuts = ("left", "right", "top", "bottom"), (view.cut_columns, view.cut_rows)
+        names = ("left", "right", "top", "bottom")
+        cuts = (view.cut_columns, view.cut_rows)
         least = [px for cut in cuts for px in np.min(cut, axis=0).tolist()]  # NaN: height unknown
         if parts := cut_off(dict(zip(names, least, strict=True))):
             what = f"the sample is cut off over the rotation: {parts}"

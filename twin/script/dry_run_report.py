@@ -42,7 +42,8 @@ def against_summary(found: LogComparison) -> Facts:
 
 def summary(report: CheckReport) -> Facts:
     """List the figures of a report as (label, value)."""
-    plan, dose = report.plan, report.dose
+    plan = report.plan
+    dose = report.dose
     images = sum(len(g.files) for g in plan.groups)
     facts = [
         ("machine, profile", f"{plan.machine.name}, {plan.profile.name}"),
@@ -110,7 +111,9 @@ def _sources(report: CheckReport) -> str:
 
 def between(found: Range | None) -> str:
     """Format a 90 % range [s]; "" if there is none."""
-    return "" if found is None else f"{found[0]:.2f} to {found[1]:.2f}"
+    if found is None:
+        return ""
+    return f"{found[0]:.2f} to {found[1]:.2f}"
 
 
 def _total(report: CheckReport) -> str:
@@ -118,14 +121,18 @@ def _total(report: CheckReport) -> str:
     plan = report.plan
     text = between(total_range(plan.steps, plan.duration_s, plan.machine.timing))
     start = "" if report.start_known else ", if axes and X-rays start as assumed below"
-    return f"{text} s{start}" if text else "unknown: no time of this machine is measured"
+    if text:
+        return f"{text} s{start}"
+    return "unknown: no time of this machine is measured"
 
 
 def _time(seconds: float) -> str:
     """Format a duration in h, min and s."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes} min {rest} s" if hours else f"{minutes} min {rest} s"
+    if hours:
+        return f"{hours} h {minutes} min {rest} s"
+    return f"{minutes} min {rest} s"
 
 
 def _span(pair: tuple[float, float]) -> str:

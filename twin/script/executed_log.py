@@ -92,7 +92,8 @@ def read_log(data: bytes) -> tuple[tuple[Executed, ...], tuple[ScriptProblem, ..
     """
     made: list[Executed] = []
     problems: list[ScriptProblem] = []
-    number, start = 0, 0
+    number = 0
+    start = 0
     for number, stamp in enumerate(LOG_STAMP.finditer(data), 1):
         try:
             made.append(_line(data[start : stamp.start()], stamp, number, problems))
@@ -195,9 +196,21 @@ def motor_cluster(motor: MotorReply) -> bytes:
         >>> motor_reply(motor_cluster(axis)) == axis, len(motor_cluster(axis))
         (True, 267)
     """
-    m, made = motor, bytearray(_REPLY_BYTES)
-    head = (m.position, m.target, m.speed, 0.0, m.acceleration, m.upper, m.lower, 0.0, m.max_speed,
-            0.0, m.max_acceleration)  # fmt: skip
+    m = motor
+    made = bytearray(_REPLY_BYTES)
+    head = (
+        m.position,
+        m.target,
+        m.speed,
+        0.0,
+        m.acceleration,
+        m.upper,
+        m.lower,
+        0.0,
+        m.max_speed,
+        0.0,
+        m.max_acceleration,
+    )
     struct.pack_into(f">{len(head)}d", made, 0, *head)
     struct.pack_into(">2d", made, _LIMITS_COPY_BYTE, m.upper, m.lower)
     return bytes(made)
@@ -226,4 +239,6 @@ def motor_reply(reply: bytes) -> MotorReply | None:
         return None
     if copy != (found.upper, found.lower) or not found.lower < found.upper:
         return None
-    return found if found.lower - 1 <= found.position <= found.upper + 1 else None
+    if found.lower - 1 <= found.position <= found.upper + 1:
+        return found
+    return None

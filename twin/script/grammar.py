@@ -48,7 +48,8 @@ class ArgumentError(ValueError):
 
     def __init__(self, message: str, code: str = "value", index: int = 0) -> None:
         super().__init__(message)
-        self.code, self.index = code, index
+        self.code = code
+        self.index = index
 
 
 @dataclass(frozen=True)
@@ -123,7 +124,9 @@ def whole(text: str, what: str, low: int, high: int, index: int = 0) -> int:
 
 def shorten(text: str, length: int = 60) -> str:
     """Shorten a text for a message to at most `length` characters."""
-    return text if len(text) <= length else text[: length - 3] + "..."
+    if len(text) <= length:
+        return text
+    return text[: length - 3] + "..."
 
 
 def is_reserved(component: str) -> bool:
@@ -253,7 +256,9 @@ def find(component: str, command: str) -> Spec | None:
     vocabulary."""
     table = _BY_KEY.get(component.lower()) or _BY_KEY[""]
     spec = table.get(command.lower())
-    return spec if spec is not None else table.get(" ".join(command.lower().split()))
+    if spec is not None:
+        return spec
+    return table.get(" ".join(command.lower().split()))
 
 
 def match(component: str, words: list[str]) -> tuple[Spec, int] | None:
@@ -274,7 +279,9 @@ def bare_name(path: str) -> str:
     empty."""
     name = re.split(r"[\\/]", path)[-1]
     name = _UNSAFE.sub("_", name).strip(" .")[:MAX_NAME_CHARS]
-    return f"_{name}" if _DEVICE.fullmatch(name) else name
+    if _DEVICE.fullmatch(name):
+        return f"_{name}"
+    return name
 
 
 def image_name(path: str) -> str | None:
@@ -282,7 +289,9 @@ def image_name(path: str) -> str | None:
     name = bare_name(path)
     if not name or name.lower() in ("tif", "tiff"):
         return None
-    return name if _SUFFIX.fullmatch(name) else f"{name}.tif"
+    if _SUFFIX.fullmatch(name):
+        return name
+    return f"{name}.tif"
 
 
 def sequence_names(prefix: str, first: int, count: int) -> tuple[str, ...]:
@@ -295,7 +304,9 @@ def kind_of(name: str) -> ImageKind:
     """Determine an image's kind by its name: di* dark, io* flat, else projection."""
     if _DARK.fullmatch(name):
         return "dark"
-    return "flat" if _FLAT.fullmatch(name) else "projection"
+    if _FLAT.fullmatch(name):
+        return "flat"
+    return "projection"
 
 
 def _move_line(k: c.MoveAbsolute) -> str:

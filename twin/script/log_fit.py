@@ -223,8 +223,10 @@ def first_difference(script: Sequence[c.Command], log: Log) -> str | None:
         if i >= len(script) or i >= len(log):
             longer = "script" if i >= len(log) else "log"
             return f"only the {longer} has command {i + 1}"
-        own, done = (replace(k, line=0, column=1, timeout_ms=None, expected_ms=None)
-                     for k in (script[i], log[i].command))  # fmt: skip
+        own, done = (
+            replace(k, line=0, column=1, timeout_ms=None, expected_ms=None)
+            for k in (script[i], log[i].command)
+        )
         if own != done:
             return f"line {script[i].line}: {describe(own)!r} is {describe(done)!r} in the log"
     return None
@@ -284,7 +286,9 @@ def unlike(log: Log, machine: Machine) -> tuple[ScriptProblem, ...]:
     """Warn of each axis of a log that the machine lacks or that has other limits there."""
     found: dict[str, ScriptProblem] = {}
     for x in log:
-        name, own, what = _axis_of(x.command, machine), x.motor, ""
+        name = _axis_of(x.command, machine)
+        own = x.motor
+        what = ""
         axis = machine.axes.get(name)
         if isinstance(x.command, c.MotorCommand) and not machine.has(name):
             what = f"machine {machine.name} has no axis {name!r}; it has: {', '.join(machine.axes)}"
@@ -339,7 +343,8 @@ def _axis(axis: Axis, replies: Sequence[MotorReply], own: Collection[c.Command])
     most = mode((r.lower, r.upper, r.max_speed, r.max_acceleration) for r in replies)
     agree = [r for r in replies if (r.lower, r.upper, r.max_speed, r.max_acceleration) == most]
     lower, upper, max_speed, max_acceleration = most
-    last, of = agree[-1], "" if len(agree) == len(replies) else f" of {len(replies)}"
+    last = agree[-1]
+    of = "" if len(agree) == len(replies) else f" of {len(replies)}"
     set_speed, set_acceleration = (
         any(isinstance(k, kind) for k in own) for kind in (c.SetSpeed, c.SetAcceleration)
     )
@@ -366,14 +371,16 @@ def _samples(logs: Sequence[Log], machine: Machine) -> dict[str, tuple[float, ..
         moved: set[str] = set()
         since = 0.0
         for x, step in zip(log, _plan(log, machine).steps, strict=True):
-            command, kind = x.command, step.kind
+            command = x.command
+            kind = step.kind
             first = isinstance(command, c.MoveAbsolute) and command.component not in moved
             if isinstance(command, c.MoveAbsolute):
                 moved.add(command.component)
             since += x.own_s
             took = max(0.0, x.own_s - step.computed_s)
             if isinstance(command, c.WaitXrayReady):
-                kind, took = "xray_ready", since if x.own_s > _MAX_READY_WAIT_S else math.nan
+                kind = "xray_ready"
+                took = since if x.own_s > _MAX_READY_WAIT_S else math.nan
             elif isinstance(command, c.XrayOn):
                 since = 0.0
             # Where an axis stood before its first move nobody knows.
@@ -426,7 +433,8 @@ def _later(times: Times) -> list[float]:
     """Return the logarithms of the later half's times over the earlier half's median,
     scaled."""
     half = (len(times) + 1) // 2
-    middle, scale = _log(median(times[:half])), math.sqrt(1.0 + 1.0 / half)
+    middle = _log(median(times[:half]))
+    scale = math.sqrt(1.0 + 1.0 / half)
     return [(_log(x) - middle) / scale for x in times[half:]]
 
 
@@ -445,7 +453,8 @@ def _spread(times: Times, own: float, common: float, shift: float) -> Spread:
     low, high = np.quantile(
         [_log(x) for x in times], (_TAIL_PROBABILITY, 1.0 - _TAIL_PROBABILITY), method="weibull"
     )
-    low, high = low - beyond + min(0.0, shift), high + beyond + max(0.0, shift)
+    low = low - beyond + min(0.0, shift)
+    high = high + beyond + max(0.0, shift)
     place = 10.0**_TIME_DECIMALS
     return Spread(
         p5_s=math.floor(max(0.0, math.exp(low) - _LOG_OFFSET_S) * place) / place,

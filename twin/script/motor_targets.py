@@ -49,9 +49,14 @@ class MotorTargets:
     def constant(self, quantity: str) -> float:
         """Return the part of a quantity that motors do not change [mm]."""
         p = self.profile
-        offsets = {"source_z": p.src_ort, "detector_x": p.det_tan, "detector_y": p.c_det,
-                   "object_x": p.axs_tan, "object_y": p.c_obj,
-                   "object_z": self.machine.sample_height_mm}  # fmt: skip
+        offsets = {
+            "source_z": p.src_ort,
+            "detector_x": p.det_tan,
+            "detector_y": p.c_det,
+            "object_x": p.axs_tan,
+            "object_y": p.c_obj,
+            "object_z": self.machine.sample_height_mm,
+        }
         return offsets.get(quantity, 0.0) + self.machine.fixed.get(quantity, 0.0)
 
     def at_home(self, quantity: str) -> float:
@@ -154,16 +159,19 @@ def beside_beam(
         raise places.lacking(what, asked="a flat field", missing=["object_x", "object_z"])
     [quantity] = places.aside
     name = places.drivers[quantity]
-    axis, factor = machine.axis(name), machine.geometry[quantity][name]
+    axis = machine.axis(name)
+    factor = machine.geometry[quantity][name]
     p = motor_poses(machine, profile, camera, positions)
     k = 0 if quantity == "object_x" else 1
-    beam, sample = (p.detector - p.source)[0], (p.axis - p.source)[0]
+    beam = (p.detector - p.source)[0]
+    sample = (p.axis - p.source)[0]
     share = float(sample[1] / beam[1])
     off = float((share * beam - sample)[2 * k])
     middle = positions.get(name, axis.home) + off / factor
     size = camera.shape[1 - k] * camera.pixels_mm(machine.detector.pixels)[k]
     away = (abs(share) * size / 2 + BESIDE_BEAM_MM + radius_mm) / abs(factor)
-    least, most = math.ceil(axis.lower * 1e6) / 1e6, math.floor(axis.upper * 1e6) / 1e6
+    least = math.ceil(axis.lower * 1e6) / 1e6
+    most = math.floor(axis.upper * 1e6) / 1e6
     upper, lower = ({name: round(min(max(middle + way, least), most), 6)} for way in (away, -away))
     freer = middle - axis.lower > axis.upper - middle
     return (lower, upper) if freer else (upper, lower)

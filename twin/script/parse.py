@@ -125,7 +125,8 @@ def _lines(text: str) -> Iterator[tuple[int, str]]:
     crlf = "\r\n" in ends
     i = 0
     while i < len(parts):
-        line, last = parts[i], i
+        line = parts[i]
+        last = i
         if _BLOB.match(line) and "\t" in line:
             last = _blob_end(parts, ends, i, crlf)
             line = "".join(parts[k] + ends[k] for k in range(i, last)) + parts[last]
@@ -289,14 +290,16 @@ class _Refused(Exception):
 
     def __init__(self, code: str, column: int, message: str) -> None:
         super().__init__(message)
-        self.code, self.column = code, column
+        self.code = code
+        self.column = column
 
 
 class _Line:
     """Reads one row and notes what is wrong with it."""
 
     def __init__(self, row: CodeLine, problems: list[ScriptProblem]) -> None:
-        self.row, self.problems = row, problems
+        self.row = row
+        self.problems = problems
         self.component = row.columns[0] if row.columns else row.words()[0]
         self.end = Field("", len(row.text) + 1)
 
@@ -314,7 +317,9 @@ class _Line:
             if not self.component.text:
                 raise _Refused("syntax", 1, "the component (first column) is missing")
             parts = self._padded() if self.row.columns is None else self._tabbed(self.row.columns)
-            return self._unknown() if parts is None else self._build(parts)
+            if parts is None:
+                return self._unknown()
+            return self._build(parts)
         except _Refused as refused:
             self.error(refused.code, refused.column, str(refused))
             return None
@@ -347,7 +352,9 @@ class _Line:
         if not spec.free or at == len(words):
             comment = next((i for i in range(start, at) if _is_comment(words[i])), None)
             if comment is not None:
-                words, at, width = words[:comment], comment, 0
+                words = words[:comment]
+                at = comment
+                width = 0
         wait = self.end
         if width:
             wait = Field(" ".join(w.text for w in words[at : at + width]), words[at].column)
@@ -449,7 +456,9 @@ class _Line:
     def _wait(self, parts: _Parts) -> c.Wait:
         """Read the wait, or assume it with a warning; check it against the trigger position."""
         is_move = parts.spec.type is c.MoveAbsolute
-        text, column, trigger = parts.wait.text, parts.wait.column, parts.second
+        text = parts.wait.text
+        column = parts.wait.column
+        trigger = parts.second
         if not text:
             assumed = c.Wait.NO_WAIT if is_move else c.Wait.ACK
             what = f"no wait is written (ACK, no wait, POS or RCV); {assumed.value!r} is assumed"
@@ -506,4 +515,6 @@ def _split(field: Field) -> list[Field]:
 def _meant(asked: str, allowed: Sequence[str]) -> str:
     """Suggest the nearest allowed name, or return ""."""
     near = nearest_name(asked, allowed)
-    return "" if near is None else f" (did you mean {near!r}?)"
+    if near is None:
+        return ""
+    return f" (did you mean {near!r}?)"

@@ -116,9 +116,11 @@ def _outside_text(view: View) -> str:
     """Describe the first image that shows no sample."""
     i = int(np.argmax(view.outside))
     rows, cols = view.camera.shape
-    side, sides = "above or below", f"rows 0 to {rows - 1}"
+    side = "above or below"
+    sides = f"rows 0 to {rows - 1}"
     if view.right[i] < -0.5 or view.left[i] > cols - 0.5:
-        side, sides = "left" if view.right[i] < -0.5 else "right", f"columns 0 to {cols - 1}"
+        side = "left" if view.right[i] < -0.5 else "right"
+        sides = f"columns 0 to {cols - 1}"
         side += " of"
     return (
         f"the sample is out of the beam: the shadow of its axis lies at column {view.axis[i]:.0f}, "
@@ -151,12 +153,15 @@ def _view(
     top = bottom = np.full(len(p), np.nan)
     size = plan.sample
     if size is not None:
-        radius, half = size.diameter_mm / 2, size.height_mm / 2
+        radius = size.diameter_mm / 2
+        half = size.height_mm / 2
         edges = [_project(p, q, shape)[:, 0] for q in _tangents(p, radius)]
-        left, right = np.minimum(*edges), np.maximum(*edges)
+        left = np.minimum(*edges)
+        right = np.maximum(*edges)
         if half > 0.0:
             rows = [_project(p, q, shape)[:, 1] for q in _rims(p, radius, half)]
-            top, bottom = np.min(rows, axis=0), np.max(rows, axis=0)
+            top = np.min(rows, axis=0)
+            bottom = np.max(rows, axis=0)
     return View(kind, camera, lines, p, left, right, top, bottom, axis)
 
 

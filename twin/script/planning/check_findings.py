@@ -87,8 +87,11 @@ class Optics:
 
     def to_dict(self) -> dict[str, object]:
         """Return the JSON form."""
-        names = {"field_mm": "field_of_view_mm", "turn_field_mm": "full_turn_diameter_mm",
-                 "truncation": "truncation_px"}  # fmt: skip
+        names = {
+            "field_mm": "field_of_view_mm",
+            "turn_field_mm": "full_turn_diameter_mm",
+            "truncation": "truncation_px",
+        }
         told = {n: list(v) if isinstance(v, tuple) else v for n, v in vars(self).items()}
         told["rows"], told["cols"] = told.pop("shape")
         return {names.get(name, name): value for name, value in told.items()}

@@ -181,8 +181,9 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
         it.
         """
         offsets = (np.arange(samples) + 0.5) / samples - 0.5
-        of_group = [g.camera.exposure_ms * g.camera.averages / 1000.0 * g.moving
-                    for g in self.groups]  # fmt: skip
+        of_group = [
+            g.camera.exposure_ms * g.camera.averages / 1000.0 * g.moving for g in self.groups
+        ]
         counts = np.array([len(g) for g in self.groups], dtype=int)
         lengths = np.repeat(np.array(of_group), counts)
         times = self.starts[:, None] + lengths[:, None] * offsets
@@ -204,10 +205,22 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
                 where = dict(zip(names, rows[i], strict=True))
                 out.append(
                     Exposure(
-                        i, g.kind, file, start, g.camera.exposure_ms, g.camera.averages, g.xrays_on,
-                        g.kV, g.power_W, g.camera, where, g.step, g.line, g.moving,
+                        i,
+                        g.kind,
+                        file,
+                        start,
+                        g.camera.exposure_ms,
+                        g.camera.averages,
+                        g.xrays_on,
+                        g.kV,
+                        g.power_W,
+                        g.camera,
+                        where,
+                        g.step,
+                        g.line,
+                        g.moving,
                     )
-                )  # fmt: skip
+                )
         return tuple(out)
 
 
@@ -250,21 +263,27 @@ class CheckReport(WithProblems):
     def start(self) -> str:
         """Where the motors stand before, in words."""
         at = ", ".join(f"{name}={x:g}" for name, x in self.plan.start.positions.items())
-        return at if self.start_known else f"{HOME_ASSUMED}: {at}"
+        if self.start_known:
+            return at
+        return f"{HOME_ASSUMED}: {at}"
 
     @property
     def sample(self) -> str:
         """What stands on the stage, in words."""
         size = self.plan.sample
         if size is None:
-            return EMPTY if self.start_known else f"{EMPTY} ({EMPTY_ASSUMED})"
+            if self.start_known:
+                return EMPTY
+            return f"{EMPTY} ({EMPTY_ASSUMED})"
         high = f", {size.height_mm:g} mm high" if size.height_mm else ""
         return f"{size.diameter_mm:g} mm across{high} ({size.source})"
 
     def to_dict(self) -> dict[str, object]:
         """Return the JSON document of `flexdt check --json`."""
-        plan, clearance = self.plan, self.clearance
-        size, found = plan.sample, clearance or Clearance()
+        plan = self.plan
+        clearance = self.clearance
+        size = plan.sample
+        found = clearance or Clearance()
         return {
             "ok": self.ok,
             "machine": plan.machine.name,

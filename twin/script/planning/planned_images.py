@@ -83,7 +83,8 @@ def infer(
     Returns:
         The inferred values, or None if speed and run-up do not determine them.
     """
-    length, rotation = _length(trigger), trigger.unit == "deg"
+    length = _length(trigger)
+    rotation = trigger.unit == "deg"
     notes: dict[str, str] = {}
     if averages is None:
         found = _averages(trigger, exposure_s, frames, length)
@@ -127,7 +128,8 @@ def _averages(
     trigger: planned.Trigger, exposure_s: float, frames: int | None, length: float
 ) -> tuple[int, str] | None:
     """Infer averages, and how; None if they are not a whole number within 2 %."""
-    speed, acceleration = trigger.speed, trigger.acceleration
+    speed = trigger.speed
+    acceleration = trigger.acceleration
     if frames is not None and frames > 1 and length > 0.0:
         period = length / (frames - 1) / speed
         how = f"speed and {frames} frames"
@@ -159,7 +161,10 @@ class ImageCollector:
         findings: Findings,
         averages: int | None,
     ) -> None:
-        self.machine, self.motors, self.tube, self.camera = machine, motors, tube, camera
+        self.machine = machine
+        self.motors = motors
+        self.tube = tube
+        self.camera = camera
         self.findings = findings
         self.trigger: planned.Trigger | None = None
         self.images: list[ExposureGroup] = []
@@ -254,12 +259,23 @@ class ImageCollector:
     ) -> ExposureGroup:
         """Add images taken from `start` on with the settings in force; make them the last
         ones."""
-        tube, self.moved = self.tube, self.motors.moving(start)
-        lit, moving = tube.lit(start), bool(self.moved)
+        tube = self.tube
+        self.moved = self.motors.moving(start)
+        lit = tube.lit(start)
+        moving = bool(self.moved)
         made = ExposureGroup(
-            kind, files, starts, self.camera.settings, lit, tube.kV, tube.power_W, step, line,
-            moving, exact or {},
-        )  # fmt: skip
+            kind,
+            files,
+            starts,
+            self.camera.settings,
+            lit,
+            tube.kV,
+            tube.power_W,
+            step,
+            line,
+            moving,
+            exact or {},
+        )
         self.last = len(self.images)
         self.images.append(made)
         return made
@@ -272,7 +288,9 @@ class ImageCollector:
         if t is None or t.trajectory.end <= start:
             return None
         moves = self.motors.all[t.motor].moves
-        return t if moves and moves[-1][1] is t.trajectory else None
+        if moves and moves[-1][1] is t.trajectory:
+            return t
+        return None
 
     def _infer(self, trigger: planned.Trigger | None, start: float) -> Inference | None:
         """Infer frames and averages that the script leaves out; warn of both."""
@@ -314,7 +332,9 @@ class ImageCollector:
             Moments (n,) [s]; motor -> positions (n,), empty if the images lie where the
             motor is.
         """
-        trajectory, unit, speed = trigger.trajectory, trigger.unit, trigger.speed
+        trajectory = trigger.trajectory
+        unit = trigger.unit
+        speed = trigger.speed
         sign = 1.0 if trajectory.target >= trigger.position else -1.0
         count = np.arange(found.frames, dtype=np.float64)
         late = start - trigger.time
@@ -345,7 +365,8 @@ class ImageCollector:
                 which = f"(from image {int(np.argmax(off))} on)"
                 what = f"slows down before the last of {len(off)} images {which}"
             self.findings.warn(code, f"{trigger.axis} {what}; images lie where the motor is")
-            starts, exact = start + period * count, {}
+            starts = start + period * count
+            exact = {}
         return starts, exact
 
     # what is worth saying about a saved image ----------------------------------------------

@@ -59,17 +59,23 @@ class Motor:
     """One motor: settings for moves to come and all motion so far."""
 
     def __init__(self, position: float, speed: float, acceleration: float) -> None:
-        self.home, self.speed, self.acceleration = position, speed, acceleration
+        self.home = position
+        self.speed = speed
+        self.acceleration = acceleration
         self.moves: list[tuple[float, Trajectory]] = []
 
     @property
     def end(self) -> float:
         """Moment at which the motor comes to rest [s]."""
-        return self.moves[-1][1].end if self.moves else 0.0
+        if self.moves:
+            return self.moves[-1][1].end
+        return 0.0
 
     def position(self, time: float) -> float:
         """Return the position at `time`, which is not before the last move."""
-        return self.moves[-1][1].position(time) if self.moves else self.home
+        if self.moves:
+            return self.moves[-1][1].position(time)
+        return self.home
 
     def move(self, target: float, time: float, speed: float, acceleration: float) -> Trajectory:
         """Start a move to `target` at `time`, from the current position and velocity."""
@@ -142,7 +148,8 @@ class PlannedTube:
     def switch(self, on: bool, time: float) -> None:
         """Turn X-rays on or off at `time`."""
         self._close(time)
-        self.on, self.known = on, True
+        self.on = on
+        self.known = True
         self.lit_from = time
 
     def lit(self, time: float) -> bool:

@@ -146,4 +146,6 @@ def _arrival(positions: Pose, pose: Pose, machine: Machine, start: StartState) -
 def _legs(start: Pose, end: Pose, route: Route | None = None) -> Sequence[Pose] | None:
     """List the moves between two poses: those of `route`, or all motors at once."""
     goal = {axis: value for axis, value in end.items() if value != start[axis]}
-    return ([goal] if goal else []) if route is None else route(start, goal)
+    if route is None:
+        return [goal] if goal else []
+    return route(start, goal)

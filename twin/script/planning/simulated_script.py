@@ -242,7 +242,8 @@ class Simulation:
         what: Rate = "speed" if isinstance(command, c.SetSpeed) else "acceleration"
         asked = getattr(command, what)
         found = rate(self.machine, command.component, what, asked)
-        note, shares = "", self.machine.moves(command.component)
+        note = ""
+        shares = self.machine.moves(command.component)
         self._tell(found)
         for motor, value in found.motors.items():
             setattr(self.motors.all[motor], what, value)
@@ -266,7 +267,8 @@ class Simulation:
         name = command.component
         asked = self.motors.targets(name, command.target, self.now)
         found = arrival(self.machine, name, asked)
-        targets, note = found.motors, ""
+        targets = found.motors
+        note = ""
         self._tell(found)
         for motor, target in targets.items():
             if found.told and target != asked[motor]:
@@ -320,7 +322,8 @@ class Simulation:
             )
             self.imaging.trigger = None
             return end
-        unit, run_up = self.machine.axes[motor].unit, abs(position - begin[motor])
+        unit = self.machine.axes[motor].unit
+        run_up = abs(position - begin[motor])
         self.imaging.trigger = planned.Trigger(
             command.component, motor, unit, trajectory, position, time, run_up
         )

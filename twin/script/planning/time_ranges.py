@@ -46,7 +46,8 @@ def total_range(steps: Iterable[_OfKind], duration_s: float, timing: Timing) -> 
     """
     if not timing.spread:
         return None
-    squares, common = [0.0, 0.0], 0.0
+    squares = [0.0, 0.0]
+    common = 0.0
     for kind, count in Counter(step.kind for step in steps).items():
         n = timing.spread[kind].n if kind in timing.spread else 1
         common += count * timing.drift * timing.seconds(kind)
