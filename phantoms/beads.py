@@ -1,7 +1,8 @@
 """Bead phantoms: cuboids of Table 6.2 with beads on a spiral, and the chiral sign-test phantom.
 
-Everything is in the object's frame, centred on the rotation axis at the sample's reference height.
-Width is along x, breadth along y, height along z. Beads must lie inside their body.
+Everything is in the object's frame, centred on the rotation axis at the sample's
+reference height. Width is along x, breadth along y, height along z. Beads must be inside
+their body.
 """
 
 from __future__ import annotations
@@ -87,8 +88,8 @@ def loop_positions(size_mm: Sequence[float], beads: int, inset_mm: float) -> Flo
     spaced in height.
 
     The layout of the thesis's public code: from (x max, y min) along y min, x min, y max
-    and x max, the last bead above the first. Where the height leaves no room, all stand
-    at mid-height.
+    and x max, the last bead above the first. If the height is too small, all are at
+    mid-height.
 
     Args:
         size_mm: width (x), breadth (y), height (z) [mm].
@@ -216,10 +217,10 @@ def cuboid_with_beads(
         body_material: None leaves the beads in air.
         bead_materials: one for each bead.
         description: one line for people.
-        assumed: what no source states.
+        assumed: facts without a source.
 
     Raises:
-        LimitError: a bead sticks out of the body; says which.
+        LimitError: a bead sticks out of the body; names it.
         UnknownNameError: an unknown material.
     """
     centers = np.asarray(beads, dtype=np.float64).reshape(-1, 3)
@@ -238,11 +239,11 @@ def cuboid_with_beads(
 
 
 def chiral_phantom() -> Phantom:
-    """Make four unequal beads at unequal distances along +x, +y, +z and -x: no mirror
-    image fits.
+    """Make four unequal beads at unequal distances along +x, +y, +z and -x: no
+    mirror image fits.
 
-    For tests of signs and handedness: the largest bead lies along +x, the middle one
-    along +y, the small one along +z, the smallest along -x and lower.
+    For tests of signs and handedness: the largest bead is along +x, the middle one along
+    +y, the small one along +z, the smallest along -x and lower.
 
     Example:
         >>> chiral_phantom().beads.shape

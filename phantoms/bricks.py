@@ -1,10 +1,10 @@
 """Stacks of hollow LEGO bricks, and the LEGO bead phantom of thesis 6.5.1.
 
 The phantom is five hollow 3 x 2 bricks with one 2 mm bead in each. Dimensions come from
-`data/lego.toml`, which labels each as thesis, literature or assumed; they must add up to the
-thesis's height and footprint. Solids are additive: a brick is its outer box minus its cavity plus
-tubes and studs, none overlapping. `flexdt_extensions.phantom_design` chooses other places for
-beads.
+`data/lego.toml`, which labels each as thesis, literature or assumed; they must add up to
+the thesis's height and footprint. Solids are additive: a brick is its outer box minus its
+cavity plus tubes and studs, none overlapping. `flexdt_extensions.phantom_design` chooses
+other places for beads.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from flexdt.twin.projection import analytic_solids as analytic
 
 
 def lego_phantom() -> Phantom:
-    """Make the LEGO phantom: 24 x 16 x 49.8 mm about the origin, its lowest face at z =
-    -24.9 mm.
+    """Make the LEGO phantom: 24 x 16 x 49.8 mm about the origin, its lowest face at
+    z = -24.9 mm.
 
     >>> len(lego_phantom().beads)
     5
@@ -124,8 +124,8 @@ class Brickwork:
     """A straight stack of equal bricks about the rotation axis.
 
     Attributes:
-        studs: along x and y; common bricks are 2 x 2, 3 x 2, 4 x 2, 6 x 2, 8 x 2, 4 x 4 (that a
-            brick of this size is sold is not checked).
+        studs: along x and y; common bricks are 2 x 2, 3 x 2, 4 x 2, 6 x 2, 8 x 2, 4 x 4
+            (that a brick of this size is sold is not checked).
         bricks: how many.
     """
 

@@ -1,13 +1,14 @@
 """A phantom taken apart by material, for projections with a spectrum and for scatter.
 
-Line integrals at one energy add up whatever the material is; a spectrum needs the path through each
-material. A solid may stand for a difference ("this bead instead of that plastic"): it is recognised
-by its attenuation and becomes one material in and the other out. Voxels of attenuation without a
-material are treated as water of matching attenuation, and the result says so.
+Line integrals at one energy add up whatever the material is; a spectrum needs the path
+through each material. A solid may be a difference ("this bead instead of that plastic"):
+it is recognised by its attenuation and becomes one material in and the other out. Voxels
+of attenuation without a material are treated as water of matching attenuation, which the
+result mentions.
 
-Scatter is simulated in a coarse grid of material amounts. For it solids and closed meshes are
-sampled as for any voxel phantom, ready voxels are averaged; each keeps its mass, so that a bead
-smaller than a voxel still attenuates and scatters as much.
+Scatter is simulated in a coarse grid of material amounts. For it solids and closed meshes
+are sampled as for any voxel phantom, ready voxels are averaged; each keeps its mass, so
+that a bead smaller than a voxel still attenuates and scatters as much.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from flexdt.twin.projection.analytic_solids import Scene, Solid, Vector
 ATTENUATION_TOLERANCE = 1e-6
 """Largest relative difference of attenuations that count as equal."""
 STAND_IN = "water"
-"""Material assumed for what has an attenuation but no composition."""
+"""Material assumed for a body that has an attenuation but no composition."""
 SUB_COLUMNS = 8
 """Samples of solids and meshes along x and y in each voxel; along z their ends are exact."""
 
@@ -47,10 +48,10 @@ class Channel:
 
     Attributes:
         material: which.
-        body: where it is: `project_body` gives the path length [mm] (values and `mu_per_mm` are
-            amounts relative to the material's own density).
+        body: where it is: `project_body` gives the path length [mm] (values and
+            `mu_per_mm` are amounts relative to the material's own density).
         thickest_mm: no path through it is longer [mm].
-        assumed: what is not known about it.
+        assumed: assumption about it.
     """
 
     material: Material
@@ -60,8 +61,8 @@ class Channel:
 
 
 def channels(phantom: Phantom) -> tuple[Channel, ...]:
-    """Divide a phantom into its materials and where they are; empty for a phantom of
-    nothing."""
+    """Divide a phantom into its materials and where they are; empty for a
+    phantom of nothing."""
     amounts: dict[str, list[Solid]] = {}
     stand_ins: set[str] = set()
     names = dict.fromkeys(solid.material for solid in phantom.scene.solids)
@@ -101,14 +102,14 @@ def channels(phantom: Phantom) -> tuple[Channel, ...]:
 def chain_through(
     parts: Sequence[Channel], panel: Detector, tube: TubeModel, mono_keV: float | None = None
 ) -> Chain:
-    """Make the chain from the paths through these materials to counts, see
-    `flexdt.twin.physics`.
+    """Make the chain from the paths through these materials to
+    counts, see `flexdt.twin.physics`.
 
     Args:
         parts: from `channels`.
         panel: the detector.
         tube: the source.
-        mono_keV: energy of all photons [keV]; None for the whole spectrum.
+        mono_keV: energy of all photons [keV]; None for the full spectrum.
     """
     return Chain(
         panel,
@@ -120,8 +121,8 @@ def chain_through(
 
 
 def attenuating(phantom: Phantom) -> tuple[tuple[Body, float], ...]:
-    """List bodies and factors: their projections times these add up to the phantom's line
-    integrals."""
+    """List bodies and factors: their projections times these add up to the
+    phantom's line integrals."""
     out: list[tuple[Body, float]] = []
     if phantom.scene.solids:
         out.append((phantom.scene, 1.0))
@@ -173,8 +174,8 @@ def _exact(surface: Surface) -> TriangleMesh | None:
 
 
 def _mesh(phantom: Phantom, surface: Surface, made_of: Material) -> Body:
-    """Convert a surface to a mesh, or to voxels where the mesh is not exact or of another
-    density."""
+    """Convert a surface to a mesh, or to voxels where the mesh is not exact or
+    of another density."""
     mesh = _exact(surface)
     if (
         mesh is not None

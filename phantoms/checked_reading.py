@@ -1,11 +1,11 @@
 """Validated reading of JSON-able documents: each reader takes a value and its key path.
 
-Documents come from outside, so every reader either returns the right type or raises PhantomError
-with the path, the value and what is allowed. `Text`, `Number`, `Lengths`, `Place` and `packed` make
-pydantic read the fields of a dataclass so.
+Documents are untrusted, so every reader either returns the right type or raises
+PhantomError with the path, the value and the allowed ones. `Text`, `Number`, `Lengths`,
+`Place` and `packed` make pydantic read the fields of a dataclass so.
 
-`scene_to_dict` and `scene_from_dict` are a scene as such a document and back; shapes are tagged by
-kind.
+`scene_to_dict` and `scene_from_dict` are a scene as such a document and back; shapes are
+tagged by kind.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _OPTIONAL_FIELDS: Final = ("axis", "axes")
 
 
 class PhantomError(TwinError):
-    """A phantom that cannot be built: what was asked, what is allowed, where."""
+    """A phantom that cannot be built: value, allowed values and place."""
 
 
 def wrong(value: object, where: str, allowed: str) -> PhantomError:
@@ -87,7 +87,7 @@ def fields(
         others: name -> reader of a field that may be left out.
 
     Returns:
-        Name -> what its reader returned.
+        Name -> result of its reader.
     """
     readers = {**needed, **others}
     for key in mapping(value, where):
@@ -226,8 +226,8 @@ _READERS: Final[Mapping[str, Reader]] = {
 
 
 def scene_to_dict(scene: analytic.Scene) -> dict[str, object]:
-    """Convert a scene to a JSON-able document: `{solids: [{shape: {kind, ...}, material,
-    mu_per_mm}]}`.
+    """Convert a scene to a JSON-able document: `{solids: [{shape: {kind,
+    ...}, material, mu_per_mm}]}`.
 
     Example:
         >>> from flexdt.phantoms import load_phantom
@@ -254,7 +254,7 @@ def scene_from_dict(document: object, where: str = "scene") -> analytic.Scene:
     """Make a scene from a document of `scene_to_dict`.
 
     Raises:
-        PhantomError: names the key path, the value and what is allowed.
+        PhantomError: names the key path, the value and the allowed ones.
 
     Example:
         >>> from flexdt.phantoms import load_phantom

@@ -1,7 +1,7 @@
 """Image quality of a scan before it is made.
 
-A prediction simulates a few views without noise for the histogram of transmission, and takes the
-darkest ray for contrast, noise and the choice of voltage and filter.
+A prediction simulates a few views without noise for the histogram of transmission, and
+takes the darkest ray for contrast, noise and the choice of voltage and filter.
 """
 
 from __future__ import annotations
@@ -53,13 +53,13 @@ from flexdt.twin.signatures import public
 SIMULATED_VIEWS: Final = 8
 """Number of views of a turn that are simulated."""
 TRANSMISSION_EDGES: Final = np.concatenate([[0.0], np.logspace(-3.95, 0.05, 41), [np.inf]])
-"""Edges of the bins of transmission: ten a decade, the open beam amid the last, and the
-rest."""
+"""Edges of the bins of transmission: ten a decade, the open beam amid the last,
+and the rest."""
 FILTERS: Final = (
     "", "aluminium:0.5", "aluminium:1", "aluminium:2", "copper:0.1", "copper:0.25", "copper:0.5",
     "copper:1",
 )  # fmt: skip
-"""Filters that are proposed, beside what the tube has."""
+"""Filters that are proposed, in addition to the tube's own."""
 VOID: Final = "void"
 
 
@@ -97,11 +97,11 @@ class Setting:
     """A setting of tube and camera, and its contrast and dose on the darkest ray.
 
     Attributes:
-        kV, filter: voltage, and the filter beside the tube's own ("" for none).
-        exposure_ms, averages: of one image; their product is the time asked for.
+        kV, filter: voltage, and the filter in addition to the tube's own ("" for none).
+        exposure_ms, averages: of one image; their product is the requested time.
         cnr: contrast of the detail to the noise, of one pixel of one image; None where
             that pixel is saturated.
-        kerma_mGy: air kerma of the whole scan on the axis, without a sample.
+        kerma_mGy: air kerma of the scan on the axis, without a sample.
     """
 
     kV: float
@@ -119,13 +119,13 @@ class Forecast:
     Attributes:
         transmission: of the views' pixels.
         saturated, starved: parts of the pixels.
-        detail: what the contrast is of.
-        asked: the setting asked for.
+        detail: the detail of the contrast.
+        asked: the requested setting.
         best: settings of the same power and time, the greatest `cnr` first.
         images: of the scan.
         seconds: that the images take at least; of a kind of scan, all of its script.
         bytes: that they take on disk; of a kind of scan, with its dark and flat images.
-        assumed: what is not known and was assumed.
+        assumed: assumptions.
     """
 
     transmission: Transmission
@@ -174,27 +174,29 @@ def expose(
 
     Args:
         sample: as for `flexdt.simulate`.
-        kV: voltage; of several the first is the setting asked for and all are tried for the best.
-            Default: the machine's, and every 10 kV of its range.
+        kV: voltage; of several the first is the setting asked for and all are tried for
+            the best. Default: the machine's, and every 10 kV of its range.
         power_W: power on the anode [W]; default: the machine's.
         filter: MATERIAL:MM beside the filters of the machine file, "" for none.
         exposure_ms: of one read-out; default: the machine's.
         averages: read-outs averaged into an image.
         mode, roi: camera mode and region of interest; default: the machine's.
         images: of the scan.
-        kind: of a scan to compose for the machine, whose time, bytes and dose are then the whole
-            script's, as `flexdt.check` has them; None counts `images` exposures and nothing else.
-        sod, sdd: distances [mm]; default: those of the script that flexdt composes for the machine
-            (600 and 1059 on the FleX-ray).
-        detail: MATERIAL:MM, a detail of so much of that material on the darkest ray, or void:MM,
-            so much less of what this ray meets most of.
+        kind: of a scan to compose for the machine, whose time, bytes and dose are then
+            the whole script's, as `flexdt.check` has them; None counts `images` exposures
+            and nothing else.
+        sod, sdd: distances [mm]; default: those of the script that flexdt composes for
+            the machine (600 and 1059 on the FleX-ray).
+        detail: MATERIAL:MM, a detail of so much of that material on the darkest ray, or
+            void:MM, so much less of what this ray meets most of.
         machine: a machine (see `flexdt.machine`) or the name of one that ships.
         material, voxel_mm: of a mesh or an array, as for `flexdt.simulate`.
         profile, start: zero offsets and the scanner before a scan of `kind`; default: the
             machine's.
 
     Returns:
-        The forecast. It is as good as the panel's figures, most of which are assumed, and knows no
+        The forecast. It is as good as the panel's figures, most of which are assumed, and
+        knows no
         scattered radiation.
 
     Raises:
@@ -245,7 +247,7 @@ def expose(
         images = plan.frames
         seconds = plan.duration_s
         total = plan.bytes
-    elif start is None:  # else the distances of a scanner as it stands
+    elif start is None:  # else the distances of a scanner at its start
         distances = ScanRequest("step", sod, sdd, frames=2, exposure_ms=camera.exposure_ms)
         plan = _plan_of(distances, scanner, profile, start)
     if plan is not None:
@@ -366,7 +368,7 @@ class _Layers:
     Args:
         parts: materials of the sample.
         machine: its tube and panel.
-        asked: the filter asked for, MATERIAL:MM or "".
+        asked: the requested filter, MATERIAL:MM or "".
     """
 
     def __init__(self, parts: Sequence[Channel], machine: Machine, asked: str) -> None:
@@ -403,8 +405,8 @@ class _SeenDetail:
     images: int
 
     def setting(self, layer: str, at: ExposureSettings) -> Setting:
-        """Compute contrast and dose of a setting; without contrast where a pixel is
-        saturated."""
+        """Compute contrast and dose of a setting; without contrast where a
+        pixel is saturated."""
         chain = self.layers.chains[layer]
         plain, changed = (
             pixel_reading(chain, self.camera, at, one.flux, one.paths_mm, one.added)
@@ -477,8 +479,8 @@ def _views(
 
 @dataclass(frozen=True)
 class _Ray:
-    """A ray through the sample: paths, its pixel's share of the beam, that of the
-    brightest pixel."""
+    """A ray through the sample: paths, its pixel's share of the beam, that of
+    the brightest pixel."""
 
     paths_mm: tuple[float, ...]
     flux: float
@@ -488,7 +490,8 @@ class _Ray:
     def with_detail(
         self, detail: tuple[Substance | None, float], substances: Sequence[Substance]
     ) -> _Ray:
-        """Add so much of a substance to the ray, or remove it from what it meets most."""
+        """Add so much of a substance to the ray, or remove it from the substance
+        that attenuates most."""
         substance, thickness = detail
         if substance is not None:
             return replace(self, added=(substance, thickness))

@@ -1,8 +1,9 @@
-"""Attenuation of the materials that phantoms are made of, from a bundled table with its sources.
+"""Attenuation of the materials that phantoms are made of, from a bundled table
+with its sources.
 
-`mu_per_mm` is given at one documented effective energy; `substance` gives the attenuation at every
-energy of a spectrum. A material that is not in the table is written FORMULA@DENSITY, such as
-C8H8@1.05 (g/cm3). Energies outside the table are errors.
+`mu_per_mm` is given at one documented effective energy; `substance` gives the attenuation
+at every energy of a spectrum. A material that is not in the table is written
+FORMULA@DENSITY, such as C8H8@1.05 (g/cm3). Energies outside the table are errors.
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ class Material:
 
     Attributes:
         name: as phantoms and files name it.
-        label: what it stands for.
+        label: its meaning.
         density_g_cm3: density.
         effective_energy_keV: where `mu_per_mm` is stated.
-        points: (energy [keV], mu/rho [cm2/g]) in growing energy; an edge is two close energies.
-            None for a material by formula, which has the elements' tables.
+        points: (energy [keV], mu/rho [cm2/g]) in growing energy; an edge is two close
+            energies. None for a material by formula, which has the elements' tables.
         source: provenance of the numbers.
         fractions: (symbol, mass fraction).
     """
@@ -56,7 +57,7 @@ class Material:
         between the points.
 
         Raises:
-            LimitError: the energy lies outside the table.
+            LimitError: the energy is outside the table.
         """
         ends = tables().energy_keV if not self.points else [energy for energy, _ in self.points]
         low = float(ends[0])

@@ -1,8 +1,9 @@
 """Overlapping meshes made one, or cut out of each other.
 
-Path lengths through a mesh count once for each of its bodies, and attenuations of several meshes
-add up. Bodies of one mesh that overlap are therefore united before they are projected, and a mesh
-of higher priority is cut out of those below it. Both are exact and made by the library manifold3d.
+Path lengths through a mesh count once for each of its bodies, and attenuations of several
+meshes add up. Bodies of one mesh that overlap are therefore united before they are
+projected, and a mesh of higher priority is cut out of those below it. Both are exact and
+made by the library manifold3d.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ def united(mesh: TriangleMesh) -> TriangleMesh | None:
 def cut(
     parts: Sequence[tuple[analytic.Scene, Sequence[Surface], float]],
 ) -> tuple[analytic.Scene, tuple[Surface, ...]]:
-    """Cut solids and surfaces so that each has only what none of a higher priority takes.
+    """Cut solids and surfaces so that those of a higher priority take precedence.
 
     Args:
         parts: solids, surfaces and the priority of both.

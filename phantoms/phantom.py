@@ -1,11 +1,12 @@
 """The phantom as a frozen value: one object for X-rays and for the scene, with one origin.
 
-`scene` holds analytic solids (exact for X-rays), `surface` a triangle mesh and `voxels` a ready
-volume. Whichever are present share the object's frame, centred on the rotation axis at the sample's
-reference height. `mesh()` and `volume()` derive the other representation on demand, so that the two
-cannot drift apart; derived arrays are not kept.
+`scene` holds analytic solids (exact for X-rays), `surface` a triangle mesh and `voxels` a
+ready volume. Whichever are present share the object's frame, centred on the rotation axis
+at the sample's reference height. `mesh()` and `volume()` derive the other representation
+on demand, so that the two cannot drift apart; derived arrays are not kept.
 
-`assemble` makes several phantoms one: their solids and meshes together, each where it stands.
+`assemble` makes several phantoms one: their solids and meshes together, each at its
+place.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ class Phantom(ArrayValue):
         size_mm: full extent along x, y, z [mm], centred on the origin.
         beads: float64 (k, 3) bead centres [mm], object frame, read-only; k may be 0.
         bead_radius_mm: float64 (k,) [mm], read-only.
-        assumed: what no public source states.
+        assumed: facts without a public source.
         surfaces: filled triangle meshes, for a phantom that came as one or several.
         voxels: ready grid, for a phantom that came as one.
     """
@@ -95,12 +96,12 @@ class Phantom(ArrayValue):
 
     @property
     def is_analytic(self) -> bool:
-        """Whether `scene` alone is the whole object for X-rays (no voxels needed)."""
+        """Whether `scene` alone is the complete object for X-rays (no voxels needed)."""
         return not self.surfaces and self.voxels is None
 
     @property
     def is_voxels(self) -> bool:
-        """Whether a ready grid alone is the whole object."""
+        """Whether a ready grid alone is the complete object."""
         return self.voxels is not None and not self.surfaces and not self.scene.solids
 
     @property
@@ -165,7 +166,7 @@ class Phantom(ArrayValue):
         """Make a phantom from a document of `to_dict`.
 
         Raises:
-            PhantomError: names the key path, the value and what is allowed.
+            PhantomError: names the key path, the value and the allowed ones.
         """
         doc = {"description": "", **reading.mapping(document, "phantom")}
         if reading.get(doc, "schema", "phantom") != SCHEMA:

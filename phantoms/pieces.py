@@ -1,7 +1,7 @@
-"""What a phantom may consist of besides analytic solids: a filled triangle mesh, a grid of voxels.
+"""Parts of a phantom besides analytic solids: a filled triangle mesh, a grid of voxels.
 
-Frozen values in the object's frame [mm] with read-only arrays; the boxes around them and the size
-of a phantom that is made of them.
+Frozen values in the object's frame [mm] with read-only arrays; the boxes around them and
+the size of a phantom that is made of them.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ class Voxels(ArrayValue):
         voxel_mm: voxel edges along x, y, z [mm].
         center_mm: of the grid, object frame [mm].
         material: name; None where only the attenuation is known, or there are several.
-        labels: uint8 [z, y, x], read-only: which of `materials` fills each voxel, counted from 1,
-            0 for nothing; None unless there are several.
+        labels: uint8 [z, y, x], read-only: which of `materials` fills each voxel, counted
+            from 1, 0 for nothing; None unless there are several.
         materials: their names.
     """
 
@@ -107,8 +107,8 @@ def boxes(
 
 
 def size_about_origin(scene: analytic.Scene, surfaces: Sequence[Surface] = ()) -> analytic.Vector:
-    """Compute the full extent along x, y, z [mm] of the box about the origin that
-    contains everything.
+    """Compute the full extent along x, y, z [mm] of the box about the origin
+    that contains everything.
 
     Raises:
         PhantomError: there is nothing.

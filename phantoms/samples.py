@@ -1,11 +1,11 @@
 """Anything to scan as a phantom: arrays, meshes, files, solids, names, and lists of them.
 
-`as_phantom` reads the samples of `flexdt.simulate` and of the command line. `load_phantom` knows
-the phantoms that ship with the package, by name: `normal-7` is a cuboid of Table 6.2 with seven
-beads.
+`as_phantom` reads the samples of `flexdt.simulate` and of the command line.
+`load_phantom` knows the phantoms that ship with the package, by name: `normal-7` is a
+cuboid of Table 6.2 with seven beads.
 
-The Shepp-Logan head phantom in three dimensions is ten additive ellipsoids, exact for X-rays. Its
-attenuation is the table's contrast times that of water.
+The Shepp-Logan head phantom in three dimensions is ten additive ellipsoids, exact for
+X-rays. Its attenuation is the table's contrast times that of water.
 """
 
 from __future__ import annotations
@@ -34,8 +34,9 @@ from flexdt.twin.projection import Volume
 from flexdt.twin.projection.analytic_solids import Ellipsoid, Scene, Solid, Vector
 from flexdt.twin.signatures import public
 
-# Contrast, semi-axes (x, y, z), centre (x, y, z), turn about z [deg], in a unit of half the height.
-# Ellipsoids: Shepp and Logan 1974 in Kak and Slaney's 3D form (1988); contrasts: Toft 1996.
+# Contrast, semi-axes (x, y, z), centre (x, y, z), turn about z [deg], in a unit of half
+# the height. Ellipsoids: Shepp and Logan 1974 in Kak and Slaney's 3D form (1988);
+# contrasts: Toft 1996.
 _ELLIPSOIDS: Final = (
     (1.0, (0.6900, 0.920, 0.810), (0.0, 0.0, 0.0), 0.0),
     (-0.8, (0.6624, 0.874, 0.780), (0.0, -0.0184, 0.0), 0.0),
@@ -63,8 +64,8 @@ ALLOWED_FORMS: Final = (
 
 @public
 def shepp_logan(size_mm: float = 50.0) -> Phantom:
-    """Make the phantom scaled so that its unit cube [-1, 1] measures `size_mm` [mm] along
-    each side.
+    """Make the phantom scaled so that its unit cube [-1, 1] measures `size_mm` [mm]
+    along each side.
 
     Example:
         >>> len(shepp_logan(50.0).scene.solids)
@@ -157,7 +158,7 @@ def as_phantom(
             file, or of a mesh; a Volume; an array [z, y, x]; a mesh with `vertices` (n,
             3) and `faces` (m, 3) [mm], such as trimesh's; a Scene or Solid; a dictionary
             as in a scene file; a pair (any of these, material); or a list of them, which
-            add up. One mesh stands with the middle of its box on the axis; those of a
+            add up. One mesh has the middle of its box on the axis; those of a
             list keep their places.
         material: of a mesh (default: abs) or of an array. Without one an array holds
             attenuation [1/mm], with one the part of each voxel that the material fills (0
@@ -168,7 +169,7 @@ def as_phantom(
             alone.
 
     Raises:
-        PhantomError, UnknownNameError: what was given, and what is allowed.
+        PhantomError, UnknownNameError: names the sample and the allowed kinds.
 
     Example:
         >>> as_phantom([{"kind": "sphere", "center": [0, 0, 0], "radius": 5, "material": "pmma"}]

@@ -30,7 +30,7 @@ def check_tube(machine: Machine, exposure: ExposureSettings) -> None:
     """Check that the machine's tube has a voltage and power.
 
     Raises:
-        LimitError: says what was asked and what is allowed.
+        LimitError: names the value and the allowed ones.
     """
     tube = machine.tube
     changed_tube(tube, TubeSettings(tube.kV, tube.power_W), exposure.kV, exposure.power_W)
@@ -52,7 +52,7 @@ def check_distances(
         sod_mm, sdd_mm: source to axis and to panel.
 
     Raises:
-        LimitError: says what was asked and what is allowed.
+        LimitError: names the value and the allowed ones.
     """
     wish = ScanRequest(
         "step",
@@ -72,7 +72,7 @@ def check_placement(phantom: Phantom, cone_vec: ConeVec, shape: tuple[int, int])
     """Check that source and panel are outside the sample, and that some ray meets it.
 
     Args:
-        phantom: stands around the origin.
+        phantom: about the origin.
         cone_vec: the views.
         shape: detector (rows, cols).
 

@@ -1,8 +1,8 @@
 """Closed triangle meshes of a phantom's pieces, for the scene and for collisions.
 
-Each analytic solid becomes one closed convex mesh in the frame of the X-ray side. A hole (negative
-attenuation in a body) is turned inside out in the joined mesh, so that signed volumes add up; there
-are no boolean operations.
+Each analytic solid becomes one closed convex mesh in the frame of the X-ray side. A hole
+(negative attenuation in a body) is turned inside out in the joined mesh, so that signed
+volumes add up; there are no boolean operations.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def parts_of(
         surfaces: triangle meshes.
         voxels: ready grid, or None.
         beads: (k, 3) bead centres [mm]: spheres there are never holes.
-        around: round solids lie inside their meshes, not the other way round.
+        around: round solids are inside their meshes, not the other way round.
     """
     import trimesh
 
@@ -97,8 +97,8 @@ def joined(parts: Sequence[SurfacePart]) -> trimesh.Trimesh:
 
 
 def _is_hole(solid: analytic.Solid, beads: FloatArray) -> bool:
-    """Return whether a solid is a hole: negative, and not a bead that absorbs less than
-    its body."""
+    """Return whether a solid is a hole: negative, and not a bead that absorbs less
+    than its body."""
     if solid.mu_per_mm >= 0.0:
         return False
     if isinstance(solid.shape, analytic.Sphere) and len(beads):
@@ -107,8 +107,8 @@ def _is_hole(solid: analytic.Solid, beads: FloatArray) -> bool:
 
 
 def solid_mesh(solid: analytic.Solid, around: bool = False) -> trimesh.Trimesh:
-    """Make the closed outward mesh of one solid [mm]; a round shape's is inscribed, or
-    lies around it."""
+    """Make the closed outward mesh of one solid [mm]; a round shape's is inscribed,
+    or encloses it."""
     mesh = _mesh(solid.shape)
     if around and isinstance(solid.shape, analytic.Sphere | analytic.Ellipsoid):
         mesh.vertices = solid.shape.center + (mesh.vertices - solid.shape.center) * _ball_around()

@@ -1,8 +1,8 @@
 """A phantom as voxels of attenuation: exact coverage along z, sub-columns across.
 
-Analytic solids and triangle meshes are voxelised along the same columns. A mesh is filled by the
-winding number with an edge rule on which both neighbours of an edge agree, so that closed meshes
-cannot leak. Open meshes, and grids that do not fit into memory, are errors.
+Analytic solids and triangle meshes are voxelised along the same columns. A mesh is filled
+by the winding number with an edge rule on which both neighbours of an edge agree, so that
+closed meshes cannot leak. Open meshes, and grids that do not fit into memory, are errors.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def voxelise(
     Args:
         scene: analytic solids, added up.
         surfaces: triangle meshes to add.
-        size_mm: what the grid must hold, along x, y, z [mm].
+        size_mm: content of the grid, along x, y, z [mm].
         voxel_mm: voxel edge [mm].
         oversample: sub-columns per voxel along x and along y.
 
@@ -71,8 +71,8 @@ def as_volume(voxels: Voxels) -> Volume:
 def _add_solid(
     data: npt.NDArray[np.float32], shape: Shape, mu: float, voxel_mm: float, oversample: int
 ) -> None:
-    """Add a convex solid to `data` [z, y, x], with `oversample` columns per voxel along x
-    and y."""
+    """Add a convex solid to `data` [z, y, x], with `oversample` columns per voxel
+    along x and y."""
     from flexdt.phantoms import voxelise_kernels as kernels
 
     nz, ny, nx = data.shape
@@ -149,8 +149,8 @@ def _columns(shape: Shape, x: FloatArray, y: FloatArray) -> _Interval:
 
 
 def _quadric(to_unit: FloatArray, center: FloatArray, x: FloatArray, y: FloatArray) -> _Interval:
-    """Solve for the interval where |to_unit (p - center)| <= 1 along z; unbounded in an
-    upright cylinder."""
+    """Solve for the interval where |to_unit (p - center)| <= 1 along z; unbounded
+    in an upright cylinder."""
     cx, cy, cz = center
     direction = to_unit[:, 2]
     a = float(direction @ direction)

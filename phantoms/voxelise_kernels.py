@@ -1,7 +1,7 @@
 """Compiled loops of the voxeliser; `voxelise` is the only caller and checks all arguments.
 
-Columns run along z. Coverage along z is exact: a voxel that a horizontal face cuts is filled by the
-fraction of its height that is inside.
+Columns run along z. Coverage along z is exact: a voxel that a horizontal face cuts is
+filled by the fraction of its height that is inside.
 """
 
 from __future__ import annotations
@@ -35,8 +35,9 @@ def _add_interval(data, iy, ix, low, high, value):
 def add_convex(data, low, high, x0, y0, oversample, value):
     """Add one convex solid given by its interval in each sub-column.
 
-    data: [z, y, x]; low, high: (rows, cols) of sub-columns in voxel heights, low > high where the
-    column misses; x0, y0: indices of the first voxel; value: attenuation of one sub-column's share.
+    data: [z, y, x]; low, high: (rows, cols) of sub-columns in voxel heights, low > high
+    where the column misses; x0, y0: indices of the first voxel; value: attenuation of one
+    sub-column's share.
     """
     for j in range(low.shape[0]):
         for i in range(low.shape[1]):
@@ -67,8 +68,8 @@ def _side(ax, ay, bx, by, px, py):
 
 @linked
 def _winding(t, px, py):
-    """Compute the winding number of the projected triangle t (3, 3) about (px, py): -1, 0
-    or +1."""
+    """Compute the winding number of the projected triangle t (3, 3) about (px, py):
+    -1, 0 or +1."""
     return (
         _side(t[0, 0], t[0, 1], t[1, 0], t[1, 1], px, py)
         + _side(t[1, 0], t[1, 1], t[2, 0], t[2, 1], px, py)
@@ -78,8 +79,8 @@ def _winding(t, px, py):
 
 @linked
 def _height(t, px, py):
-    """Compute the height of the plane of triangle t above (px, py), within the triangle's
-    heights."""
+    """Compute the height of the plane of triangle t above (px, py), within
+    the triangle's heights."""
     ux, uy, uz = t[1, 0] - t[0, 0], t[1, 1] - t[0, 1], t[1, 2] - t[0, 2]
     vx, vy, vz = t[2, 0] - t[0, 0], t[2, 1] - t[0, 1], t[2, 2] - t[0, 2]
     area = ux * vy - uy * vx
@@ -92,17 +93,17 @@ def _height(t, px, py):
 
 @linked
 def _span(low, high, n):
-    """Compute the sub-column indices whose centres i + 0.5 can lie in [low, high]."""
+    """Compute the sub-column indices whose centres i + 0.5 can be in [low, high]."""
     return max(int(np.floor(low - 0.5)), 0), min(int(np.ceil(high - 0.5)) + 1, n)
 
 
 @serial
 def cross(triangles, starts, counts, heights, signs):
-    """Count the surface crossings of every sub-column; write their heights and signs, too, unless
-    `heights` is empty.
+    """Count the surface crossings of every sub-column; write their heights and signs,
+    too, unless `heights` is empty.
 
-    triangles: (n, 3, 3), x and y in sub-columns; counts: int32 (rows, cols), to be zero; starts:
-    (rows, cols) where in heights and signs those of a sub-column begin.
+    triangles: (n, 3, 3), x and y in sub-columns; counts: int32 (rows, cols), to be zero;
+    starts: (rows, cols) where in heights and signs those of a sub-column begin.
     """
     listing = heights.size > 0
     for f in range(triangles.shape[0]):
@@ -126,8 +127,8 @@ def cross(triangles, starts, counts, heights, signs):
 def add_surface(data, starts, counts, heights, signs, oversample, value):
     """Fill between crossings wherever the winding number is not zero.
 
-    Overlapping bodies fill once, inward shells are cavities. Returns the number of columns whose
-    crossings do not close.
+    Overlapping bodies fill once, inward shells are cavities. Returns the number of
+    columns whose crossings do not close.
     """
     leaks = 0
     for j in range(counts.shape[0]):

@@ -1,4 +1,4 @@
-"""What two processes must agree on: messages, framing, codec, images, errors. No sockets."""
+"""The agreement between two processes: messages, framing, codec, images, errors. No sockets."""
 
 from flexdt.protocol.codec import Codec
 from flexdt.protocol.connection import MAX_FRAME, Connection, Prepared

@@ -1,9 +1,10 @@
-"""Events of the scanner software's own socket interface: JSON objects that say RCV, FDB, ACK, ERR.
+"""Events of the scanner software's own socket interface: JSON objects of the types RCV,
+FDB, ACK, ERR.
 
-A command is an event whose `reply type` is empty (some programs write SEND or SENT). Whoever
-executes it answers with events that bear the same UUID: RCV at once, FDB while it lasts, then one
-ACK or ERR. The interface's description asks replies for the command's tick count too, but programs
-renew it or leave it out. Time is an argument.
+A command is an event whose `reply type` is empty (some programs write SEND or SENT).
+Whoever executes it answers with events that bear the same UUID: RCV at once, FDB while it
+lasts, then one ACK or ERR. The interface's description requires the command's tick count
+in replies as well, but programs renew it or leave it out. Time is an argument.
 """
 
 from __future__ import annotations
@@ -38,10 +39,10 @@ FIELDS: Final = ("component", "comp_phys", "command", "arg1", "arg2", "reply", "
 
 
 class ReplyType(Enum):
-    """What an event is."""
+    """Type of an event."""
 
     SEND = ""
-    """A command for whoever bears the component's name."""
+    """A command for the component that it names."""
     RCV = "RCV"
     """The command has been received."""
     FDB = "FDB"
@@ -49,7 +50,7 @@ class ReplyType(Enum):
     ACK = "ACK"
     """It is complete."""
     ERR = "ERR"
-    """It failed; `reply` says why."""
+    """It failed; `reply` has the reason."""
 
 
 _REPLY_TYPES: Final[Mapping[str, ReplyType]] = {
@@ -60,7 +61,7 @@ _REPLY_TYPES: Final[Mapping[str, ReplyType]] = {
 
 
 class AcquilaError(ValueError):
-    """Bytes that are not an event; says what is wrong and what is allowed."""
+    """Bytes that are not an event; names the problem and the allowed values."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +131,7 @@ def parse_event(data: bytes | str) -> AcquilaEvent:
 
     Raises:
         AcquilaError: not a JSON object with a component and a command, or a field that is
-            too long or holds what no event can carry.
+            too long or has characters that no event can carry.
     """
     if len(data) > MAX_BYTES:
         raise AcquilaError(f"an event of {len(data)} bytes; allowed: {MAX_BYTES}")
@@ -164,8 +165,8 @@ def format_event(event: AcquilaEvent) -> str:
 
 
 class Exchange:
-    """Makes the replies to one command: `received` first, `feedback` while it lasts, then
-    one end.
+    """Makes the replies to one command: `received` first, `feedback` while it
+    lasts, then one end.
 
     Args:
         command: the command, with its UUID already assigned.
@@ -235,8 +236,8 @@ def _plain(name: str, text: str) -> str:
 
 
 def _whole(value: object) -> int:
-    """Convert a tick count to an integer; return 0 for anything else than a number below
-    2^64."""
+    """Convert a tick count to an integer; return 0 for anything else than a
+    number below 2^64."""
     if isinstance(value, bool) or not isinstance(value, int | float) or value != value:
         return 0
     return int(value) if abs(value) < 2**64 else 0

@@ -1,9 +1,9 @@
 """Bytes to plain documents and back, in JSON and in MessagePack; strict both ways.
 
-Reading rejects whatever only one of the two forms can hold and whatever could do harm: NaN and
-infinities in JSON, invalid UTF-8, lone surrogates, nesting above 200, MessagePack extension types,
-and containers that declare more members than they have bytes (which would make the decoder
-preallocate without limit). Framing belongs to `connection`.
+Reading rejects whatever only one of the two forms can hold and whatever could do harm:
+NaN and infinities in JSON, invalid UTF-8, lone surrogates, nesting above 200, MessagePack
+extension types, and containers that declare more members than they have bytes (which
+would make the decoder preallocate without limit). Framing belongs to `connection`.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ def read_json(data: bytes | bytearray | memoryview) -> object:
     """Parse one JSON document; a leading byte order mark is dropped.
 
     Raises:
-        ValueError: says what is wrong and where; a name that an object has twice is, too.
+        ValueError: names the problem and its place; a name that an object has twice is,
+            too.
     """
     raw = bytes(data).removeprefix(BYTE_ORDER_MARK)
     document = from_json(raw, allow_inf_nan=False)
@@ -77,8 +78,7 @@ def json_pieces(document: object) -> list[bytes]:
     """Encode like `write_json`, in pieces; large binary values bypass the encoder.
 
     The encoder writes an unguessable mark in place of each large value; the marks are
-    then replaced by the value's base64, so that no second copy of the whole document is
-    ever made.
+    then replaced by the value's base64, so that the document is never copied as a whole.
 
     Raises:
         ValueError, TypeError: as there.
@@ -110,7 +110,7 @@ def read_msgpack(data: bytes | bytearray | memoryview) -> object:
     """Parse one MessagePack object, with strings as UTF-8 and binary values as bytes.
 
     Raises:
-        ValueError: says what is wrong.
+        ValueError: names the problem.
     """
     size = len(data)
     # A first pass that builds nothing: every declared member must be there, or else a few bytes

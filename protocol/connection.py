@@ -1,16 +1,19 @@
 """One connection without a socket: bytes in, messages out; messages in, bytes out.
 
-The first byte decides for the connection's whole life: 0x00 (the high byte of a length below
-16 MiB) means length-prefixed MessagePack, anything else JSON lines. A message that is too long or
-broken comes out as `Malformed`; a JSON connection recovers at the next newline, a MessagePack
-connection at the end of the frame. The caller owns the network. No received bytes make a method
-block or raise; only the end of the stream may be an error (`receive_end`).
+The first byte determines the codec of the connection: 0x00 (the high byte of a length
+below 16 MiB) means length-prefixed MessagePack, anything else JSON lines. A message that
+is too long or broken comes out as `Malformed`; a JSON connection recovers at the next
+newline, a MessagePack connection at the end of the frame. The caller owns the network. No
+received bytes make a method block or raise; only the end of the stream may be an error
+(`receive_end`).
 
-Received bytes are divided into whole messages at once; these wait, still as bytes, in a queue.
+Received bytes are divided into complete messages at once; these wait, still as bytes, in
+a queue.
 
-`pack` and `unpack` are for who reads and writes MessagePack frames itself: a message whose last
-member is (nested) `data` of many bytes is written as a small head and the payload's own memory;
-read back, `data` is a view into the received frame. The bytes on the wire are an ordinary frame.
+`pack` and `unpack` are for callers that read and write MessagePack frames themselves: a
+message whose last member is (nested) `data` of many bytes is written as a small head and
+the payload's own memory; read back, `data` is a view into the received frame. The bytes
+on the wire are an ordinary frame.
 """
 
 from __future__ import annotations
@@ -31,7 +34,7 @@ MAX_FRAME: Final = 2**24 - 1
 """Largest MessagePack frame [bytes]: its length's first byte must be zero."""
 
 MAX_ANSWER: Final[Mapping[Codec, int]] = {Codec.JSON: 64 << 20, Codec.MSGPACK: MAX_FRAME}
-"""Largest answer [bytes] of a method that can tell its size before it makes the answer."""
+"""Largest answer [bytes] of a method that knows its size in advance."""
 
 MAX_OVERTAKING_BYTES: Final = 1 << 16
 """Larger messages are sent in pieces and do not overtake others [bytes]."""
@@ -127,8 +130,7 @@ class Connection:
         return bool(self._begun) or self._skip > 0
 
     def receive_data(self, data: bytes | bytearray | memoryview) -> list[Message]:
-        """Receive bytes from the peer and decode the messages that they complete, in
-        order."""
+        """Receive bytes from the peer and decode the messages that they complete, in order."""
         self.feed(data)
         out: list[Message] = []
         while (raw := self.next_raw()) is not None:
@@ -295,8 +297,7 @@ class Connection:
         return out
 
     def holds(self, name: bytes) -> bool:
-        """Return whether a message completed by the last `feed` contains the bytes
-        `name`."""
+        """Return whether a message completed by the last `feed` contains the bytes `name`."""
         return name in _joined(islice(self._new, self._fed, None))
 
     def _end(self) -> None:

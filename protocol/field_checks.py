@@ -1,4 +1,5 @@
-"""Checks that types of the wire's fields share; each raises ValueError with what is allowed."""
+"""Checks that types of the wire's fields share; each raises ValueError with
+the allowed values."""
 
 from __future__ import annotations
 
@@ -16,15 +17,14 @@ from flexdt.protocol.rpc_errors import RpcError
 _CONTROL_CHARACTER = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 _CONTROL_BUT_LINE_END = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff]")
 MAX_STEM = 100
-"""Longest name, percent-encoded [bytes]: it becomes a file name, with a date and a
-suffix."""
+"""Longest name, percent-encoded [bytes]: it becomes a file name, with a date and a suffix."""
 MAX_SIDE_MM = 1e4
 """Longest side of a grid of voxels [mm]."""
 
 
 def few(most: int) -> BeforeValidator:
-    """Make a validator that rejects an object of more than `most` members before it reads
-    any."""
+    """Make a validator that rejects an object of more than `most` members
+    before it reads any."""
 
     def check(value: object) -> object:
         if isinstance(value, Mapping) and len(value) > most:
@@ -81,8 +81,7 @@ def plain_name(value: str) -> str:
 
 
 def require_extent(shape: tuple[int, ...], voxel_mm: tuple[float, ...]) -> None:
-    """Check that no side of a grid of `shape` (z, y, x) and `voxel_mm` (x, y, z) is too
-    long.
+    """Check that no side of a grid of `shape` (z, y, x) and `voxel_mm` (x, y, z) is too long.
 
     Raises:
         ValueError: a side is longer than `MAX_SIDE_MM`.

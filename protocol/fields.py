@@ -1,8 +1,9 @@
 """Base classes and field types shared by all wire models.
 
-Parameters are strict (no text for a number, no unknown member); results may grow, so a client
-keeps members that it does not know. The types of requests are bounded, so that the schema rejects
-what the code behind it could not handle. `methods` has the models of the methods.
+Parameters are strict (no text for a number, no unknown member); results may grow, so a
+client keeps members that it does not know. The types of requests are bounded, so that the
+schema rejects values that the code behind it cannot handle. `methods` has the models of
+the methods.
 """
 
 from __future__ import annotations
@@ -34,8 +35,7 @@ from flexdt.protocol.field_checks import (
 from flexdt.protocol.image import Dtype
 
 MAX_UNKNOWN = 50
-"""Largest number of members beyond the declared fields before an object is rejected
-unread."""
+"""Largest number of members beyond the declared fields before an object is rejected unread."""
 
 _MODEL = ConfigDict(frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True)
 """Configuration of all models; the text below a field is its description in OpenRPC."""
@@ -64,8 +64,8 @@ AxisName = Annotated[
 """A motor or virtual axis of the machine, e.g. `mag_obj`."""
 Positive = Annotated[float, Gt(0)]
 NonNegative = Annotated[float, Ge(0)]
-# Ranges of numbers in requests. The machine's own limits are far narrower and reported by name with
-# -32001; these ranges only keep the arithmetic behind them from overflowing.
+# Ranges of numbers in requests. The machine's own limits are far narrower and reported by
+# name with -32001; these ranges only keep the arithmetic behind them from overflowing.
 Position = Annotated[float, Ge(-1e9), Le(1e9)]
 """[mm or deg]; angles are accumulated."""
 Velocity = Annotated[float, Ge(-1e6), Le(1e6)]

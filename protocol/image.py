@@ -1,8 +1,8 @@
 """Arrays on the wire: {dtype, shape, data}, little-endian, C order.
 
-In memory `data` is raw bytes; the JSON codec turns bytes into base64 on the way out, and models
-turn base64 back into bytes on the way in. Only plain numbers are allowed as dtype, so no payload
-can carry a Python object.
+In memory `data` is raw bytes; the JSON codec turns bytes into base64 on the way out, and
+models turn base64 back into bytes on the way in. Only plain numbers are allowed as dtype,
+so no payload can carry a Python object.
 """
 
 from __future__ import annotations
@@ -41,8 +41,7 @@ def encode(array: npt.NDArray[np.generic]) -> dict[str, object]:
 
 
 def decode(value: Mapping[str, object]) -> npt.NDArray[np.generic]:
-    """Convert an image value to an array, read-only, without a copy where `data` is
-    bytes.
+    """Convert an image value to an array, read-only, without a copy where `data` is bytes.
 
     Raises:
         RpcError: -32602, naming what does not fit.

@@ -1,20 +1,20 @@
 """JSON-RPC 2.0 messages as frozen values, and their plain (dict and list) form.
 
-`from_plain` never raises: a document that is not a message becomes `Malformed`, which holds the
-error to answer with. Bytes are the business of `codec`, methods of `methods`.
+`from_plain` never raises: a document that is not a message becomes `Malformed`, which
+holds the error to answer with. Bytes are the business of `codec`, methods of `methods`.
 
-`Connection` turns bytes into messages; a `Correlation` above it, at either end, knows which
-requests have no answer yet. A client asks and a server answers, so each role may receive only some
-messages:
+`Connection` turns bytes into messages; a `Correlation` above it, at either end, knows
+which requests have no answer yet. A client sends requests and a server answers, so each
+role may receive only some messages:
 
 | role   | may receive                                      | sends                          |
 |--------|--------------------------------------------------|--------------------------------|
 | client | answers to its own requests, notifications       | requests, notifications        |
 | server | requests, notifications                          | answers, each once, and events |
 
-Anything else is a `ProtocolError`, after which the connection cannot be trusted: if one answer has
-a wrong id, the right one may have been given to somebody else. Either peer may end the stream, but
-only between two messages (see `Connection.receive_end`).
+Anything else is a `ProtocolError`, after which the connection cannot be trusted: if one
+answer has a wrong id, the right one may have been sent to another client. Either peer may
+end the stream, but only between two messages (see `Connection.receive_end`).
 """
 
 from __future__ import annotations
@@ -280,7 +280,7 @@ class Correlation(Generic[_W]):
 
     Attributes:
         reason: an error that the peer reported about the connection as a whole.
-        violation: what the peer did that the protocol forbids; the connection must be closed.
+        violation: violation of the protocol by the peer; the connection must be closed.
 
     Example:
         >>> calls = Correlation[str](Role.CLIENT)
@@ -295,8 +295,8 @@ class Correlation(Generic[_W]):
         self.reason: RpcError | None = None
         self.violation: ProtocolError | None = None
         self._ids = itertools.count(1)
-        # Requests sent and not answered. The waiter of an abandoned request is None; its answer may
-        # still come and is no violation.
+        # Requests sent and not answered. The waiter of an abandoned request is None; its
+        # answer may still come and is no violation.
         self._open_requests: dict[Id, _W | None] = {}
         # Requests received and not answered; a client may use an id twice at the same time.
         self._owed_answers: Counter[Id] = Counter()

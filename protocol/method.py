@@ -31,7 +31,7 @@ class Method(Generic[_P, _R]):
         name: as on the wire.
         params, result: their models.
         summary: one line for people.
-        control: only the controller may call it (it is taken where nobody holds it).
+        control: only the controller may call it (a client becomes the controller if there is none).
         safe: reads only, so a client may repeat it after a lost connection.
         urgent: handled on arrival, ahead of the connection's earlier requests.
         by_hand: an error while a job runs, and allowed while it is paused.
@@ -87,7 +87,7 @@ def parse_params(
     """Validate the parameters of a call, given by name, by position, or not at all.
 
     Raises:
-        RpcError: -32602, every problem with its path and what was asked.
+        RpcError: -32602, every problem with its path and value.
     """
     fields = method.params.model_fields
     if isinstance(given, list):

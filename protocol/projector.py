@@ -1,8 +1,8 @@
 """Parameters and results of the projector server's methods.
 
-Arrays travel as image values; `cone_vec` may also be a list of rows. A result larger than a
-frame comes in parts: notifications `part` {request, start, data} with `start` counted in elements
-of the C-ordered result, then the response with `parts` instead of `data`.
+Arrays travel as image values; `cone_vec` may also be a list of rows. A result larger than
+a frame comes in parts: notifications `part` {request, start, data} with `start` counted
+in elements of the C-ordered result, then the response with `parts` instead of `data`.
 """
 
 from __future__ import annotations
@@ -153,8 +153,8 @@ class VolumePut(f.Params):
 
     @model_validator(mode="after")
     def _one(self) -> VolumePut:
-        """Check that exactly one of scene, grid and mesh is given, and data where it
-        belongs."""
+        """Check that exactly one of scene, grid and mesh is given, and data
+        where it belongs."""
         if sum(one is not None for one in (self.scene, self.grid, self.mesh)) != 1:
             raise ValueError("give one of scene, grid, mesh")
         if (self.scene is None) != (self.data is not None):

@@ -1,8 +1,8 @@
 """Error codes of the wire and the one exception that carries them.
 
-JSON-RPC's own codes, the twin's (-32001 to -32008, fixed), two of the projector's, and one that the
-viewer answers its pages with. The `data` of an error holds the value that was received and what is
-allowed instead. The server maps the twin's own exceptions to these codes.
+JSON-RPC's own codes, the twin's (-32001 to -32008, fixed), two of the projector's, and
+one that the viewer answers its pages with. The `data` of an error holds the received
+value and the allowed ones. The server maps the twin's own exceptions to these codes.
 """
 
 from __future__ import annotations
@@ -96,14 +96,14 @@ def invalid_params(
 
 
 def problem(path: str, message: str, asked: object) -> dict[str, object]:
-    """Make one entry of `invalid_params`: the parameter's path, what is wrong, the value
-    given."""
+    """Make one entry of `invalid_params`: the parameter's path, what is wrong,
+    the value given."""
     return {"path": path, "message": message, "asked": asked}
 
 
 def internal(trace: str | None = None) -> RpcError:
-    """Make the error for a failure of the server; its log has the details under the id
-    `trace`."""
+    """Make the error for a failure of the server; its log has the details under
+    the id `trace`."""
     message = "internal error; the server's log has the details"
     return RpcError(Code.INTERNAL, message, None if trace is None else {"trace": trace})
 
@@ -142,8 +142,7 @@ def superseded(key: str) -> RpcError:
 
 
 def link_down(why: str) -> RpcError:
-    """Make the error for a request without a connection to the twin, or one that was
-    lost."""
+    """Make the error for a request without a connection to the twin, or one that was lost."""
     return RpcError(Code.LINK_DOWN, f"no connection to the twin: {why}")
 
 
@@ -153,8 +152,7 @@ def cancelled(request: object) -> RpcError:
 
 
 def clip(value: object, limit: int = 200) -> str:
-    """Convert `value` to text of at most `limit` characters, without formatting more of
-    it."""
+    """Convert `value` to text of at most `limit` characters, without formatting more of it."""
     text = value[: limit + 1] if isinstance(value, str) else _brief(value, limit)
     text = text.encode("utf-8", "backslashreplace").decode("utf-8")  # no lone surrogates
     if len(text) <= limit:

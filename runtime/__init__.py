@@ -1,1 +1,1 @@
-"""What every process needs: event loop, access, log, metrics, workers, supervisor."""
+"""The needs of every process: event loop, access, log, metrics, workers, supervisor."""

@@ -1,7 +1,7 @@
 """Who may connect: bind addresses, tokens, TLS, and the limits of a connection.
 
-A server on the loopback needs no token; on any other address it does not start without one. Tokens
-are compared in constant time.
+A server on the loopback needs no token; on any other address it does not start without
+one. Tokens are compared in constant time.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from urllib.parse import urlsplit
 
 
 class AccessError(ValueError):
-    """A configuration that would admit anybody; the message says what is missing."""
+    """A configuration that would admit anybody; the message names the missing part."""
 
 
 class AccessFileError(AccessError):
@@ -28,7 +28,8 @@ class AccessFileError(AccessError):
 
 @dataclass(frozen=True)
 class ConnectionLimits:
-    """What one connection, and all of them, may cost. Sizes in bytes, times in real seconds.
+    """Limits on the cost of one connection, and of all of them. Sizes in bytes,
+    times in real seconds.
 
     Attributes:
         max_message: largest line or frame received (MessagePack: below 16 MiB anyway).
@@ -36,7 +37,8 @@ class ConnectionLimits:
         max_clients: connections at a time.
         max_waiting: queued requests of one connection above which it is not read.
         max_events: ordered events (job, log) queued for a client that does not read.
-        max_unsent: bytes of replies queued for a client, above which its next request waits.
+        max_unsent: bytes of replies queued for a client, above which its next request
+            waits.
         send_timeout_s: a client that takes nothing for so long is disconnected.
         message_timeout_s: a message begun must be complete after this.
         hello_timeout_s: with a token, session.hello must come within this.
@@ -61,7 +63,7 @@ class ConnectionLimits:
 
 @dataclass(frozen=True)
 class TwinLimits:
-    """What all clients of a twin together may cost.
+    """Limits on the cost of all clients of a twin together.
 
     Attributes:
         max_jobs: jobs in the queue.
@@ -70,12 +72,12 @@ class TwinLimits:
         max_upload: size of an uploaded sample [bytes].
         max_samples: uploads there may be.
         max_corrections: corrections there may be.
-        disk_quota: of the data directory [bytes]; None: what the disk holds.
+        disk_quota: of the data directory [bytes]; None: no limit but the disk's.
         max_subscriptions: topics that all connections together follow.
-        max_views: different kinds and binnings in which they want their events; an image is
-            rendered and encoded once for each.
-        control_idle_s: a controller idle for this long loses control to the next client that
-            requests it [s].
+        max_views: different kinds and binnings in which they want their events; an image
+            is rendered and encoded once for each.
+        control_idle_s: a controller idle for this long loses control to the next client
+            that requests it [s].
     """
 
     max_jobs: int = 1000
@@ -92,7 +94,7 @@ class TwinLimits:
 
 @dataclass(frozen=True)
 class ViewerLimits:
-    """What all pages of a viewer together may cost.
+    """Limits on the cost of all pages of a viewer together.
 
     Attributes:
         max_pages: pages open at a time; each is a connection to the twin, and four views.
@@ -113,7 +115,7 @@ def with_limits(words: Sequence[str], default: _L, others: Collection[str] = ())
         others: names that are not its own and are passed over.
 
     Raises:
-        AccessError: no such limit, or not a number above zero; says what is allowed.
+        AccessError: no such limit, or not a number above zero; lists the limits.
 
     Returns:
         `default` with the values of those words that are its own.
@@ -158,7 +160,7 @@ def is_rebound(host: str) -> bool:
     """Return whether a request to a loopback port is that of a page whose site's name was
     rebound to it.
 
-    A page may send requests to its own site without being asked, and its site may say
+    A page may send requests to its own site without permission, and its site may claim
     that its name is now 127.0.0.1 (DNS rebinding). Its browser sends that name as the
     request's Host.
 
@@ -211,8 +213,8 @@ def read_token(file: Path | None) -> str | None:
 
 
 def client_tls(authority: Path | None, *, any_name: bool = False) -> ssl.SSLContext | None:
-    """Make a client's TLS context that trusts the certificates of a PEM file alone; None
-    without one.
+    """Make a client's TLS context that trusts the certificates of a PEM file alone;
+    None without one.
 
     Args:
         authority: the file.

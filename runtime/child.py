@@ -1,9 +1,9 @@
 """`python -m flexdt.runtime.child MODULE ARGS...`: a module that ends with its parent.
 
-The parent keeps the child's standard input open as a pipe. When the parent goes away, for whatever
-reason, even killed outright, the pipe closes and the child receives SIGTERM, its normal way to
-stop; if it has not stopped after a grace period it is killed. This works wherever pipes do and
-needs no support in the module.
+The parent keeps the child's standard input open as a pipe. When the parent goes away, for
+whatever reason, even killed outright, the pipe closes and the child receives SIGTERM, its
+normal way to stop; if it has not stopped after a grace period it is killed. This works
+wherever pipes do and needs no support in the module.
 """
 
 from __future__ import annotations

@@ -1,8 +1,10 @@
-"""Kernels compiled before they are needed, on all cores: `python -m flexdt.runtime.compile_ahead`.
+"""Kernels compiled before they are needed, on all cores:
+`python -m flexdt.runtime.compile_ahead`.
 
-numba compiles under one lock, so each group of kernels has a process of its own, which runs it on a
-tiny problem and leaves it in numba's disk cache. Groups that are there already cost nothing; what
-is not compiled here compiles at its first use. Names of groups may follow the command.
+numba compiles under one lock, so each group of kernels has a process of its own, which
+runs it on a tiny problem and leaves it in numba's disk cache. Groups that are there
+already cost nothing; other kernels compile at their first use. Names of groups may follow
+the command.
 """
 
 from __future__ import annotations
@@ -98,7 +100,8 @@ GROUPS: Final[dict[str, tuple[Callable[[], None], str]]] = {
     "bead detection": (_detection, "calibration.detect.spot_kernels:fit_ball"),
     "FDK": (_reconstruction, "reconstruction.kernels.fdk_kernels:warp"),
 }
-"""Group -> what compiles it, and the entry point that it compiles last; the slowest first."""
+"""Group -> function that compiles it, and the entry point that it compiles last;
+the slowest first."""
 ANALYSIS: Final = ("calibration", "bead detection", "FDK")
 """Groups that the analysis of a data set needs."""
 
@@ -114,12 +117,11 @@ def is_compiled(group: str) -> bool:
 
 
 def compile_ahead(groups: Sequence[str], note: Callable[[str], None]) -> None:
-    """Compile what is missing, as many groups at a time as there are cores.
+    """Compile the missing groups, as many at a time as there are cores.
 
     Args:
         groups: names, of `GROUPS`.
-        note: called with a line about what is compiled, when a group is done, and every
-            `SILENT_S`.
+        note: called with a line about the groups, when one is done, and every `SILENT_S`.
     """
     missing = [group for group in groups if not is_compiled(group)]
     if not missing:
@@ -137,8 +139,8 @@ def compile_ahead(groups: Sequence[str], note: Callable[[str], None]) -> None:
 
 
 def elsewhere(group: str) -> None:
-    """Compile a group in a process that ends with this one; failures appear at the first
-    use."""
+    """Compile a group in a process that ends with this one; failures appear at
+    the first use."""
     with start(["--here", group]) as process:
         process.wait()
 

@@ -1,12 +1,13 @@
-"""Pages for monitoring, `/healthz` and `/metrics`, by the threads of prometheus_client's server.
+"""Pages for monitoring, `/healthz` and `/metrics`, by the threads
+of prometheus_client's server.
 
-Beyond the loopback, pages other than `/healthz` need the server's token (`Authorization: Bearer
-...`); on the loopback, requests of other sites' pages are refused by their Host. Twin, projector
-and viewer supply the figures; this module puts them into the pages. A page is made in a turn of the
-event loop, to which the figures belong. Requests are counted as they are answered; gauges are read
-at the moment of the scrape.
+Beyond the loopback, pages other than `/healthz` need the server's token (`Authorization:
+Bearer ...`); on the loopback, requests of other sites' pages are refused by their Host.
+Twin, projector and viewer supply the figures; this module puts them into the pages. A
+page is made in a turn of the event loop, to which the figures belong. Requests are
+counted as they are answered; gauges are read at the moment of the scrape.
 
-Each connection has a thread. One that has not sent a whole request that is answered waits in a room
+Each connection has a thread. One whose request is not complete waits in a room
 (`runtime/waiting_room.py`); so does one that is being answered, in a second room.
 """
 
@@ -78,7 +79,7 @@ def _figure(
 
 
 gauge, counter = partial(_figure, "gauge"), partial(_figure, "counter")
-"""What may go up and down; what only grows."""
+"""A figure that may go up and down; a figure that only grows."""
 
 
 class Requests:
@@ -111,8 +112,8 @@ class _Collected:
 
 
 def render(figures: Iterable[Metric]) -> str:
-    """Format the page in Prometheus's text format, with the library's figures of the
-    process."""
+    """Format the page in Prometheus's text format, with the library's figures
+    of the process."""
     process = ProcessCollector(registry=None).collect()
     return generate_latest(_Collected([*figures, *process])).decode()
 
@@ -210,7 +211,7 @@ def _application(pages: Pages, token: str | None, *, loopback: bool) -> Callable
 
     Args:
         pages: path -> function that makes the page.
-        token: required beyond `OPEN_PAGES`; None: of nobody.
+        token: required beyond `OPEN_PAGES`; None: of no client.
         loopback: whether requests of other sites' pages are rejected by their Host.
     """
     loop = asyncio.get_running_loop()
@@ -272,7 +273,7 @@ async def served_pages(pages: Pages, settings: ServerSettings) -> AsyncIterator[
         settings: host and port; beyond the loopback only with a token.
 
     Yields:
-        What the process's `ready` line says about it.
+        Facts for the process's `ready` line.
 
     Raises:
         AccessError: the address can be reached by others and there is no token.
@@ -310,8 +311,8 @@ def watching_pages(
     """Make the pages of a running server.
 
     Args:
-        health: content of `/healthz` beside its status.
-        figures: of `/metrics`, beside those that every process has.
+        health: content of `/healthz` in addition to its status.
+        figures: of `/metrics`, in addition to those that every process has.
         requests: answered so far; None where there are none to count.
         failed: whether a part of the server has died; then `/healthz` answers 503.
     """

@@ -1,11 +1,11 @@
 """Structured logs: each line on standard error is one JSON object.
 
-`log(event, **facts)` goes through `logging`, so a host program may route it elsewhere. Callers pass
-the facts that matter, never images, tokens or whole messages.
+`log(event, **facts)` goes through `logging`, so a host program may route it elsewhere.
+Callers pass the facts that matter, never images, tokens or complete messages.
 
-Lines of both servers carry the id of the request that is being worked on. The twin gives every
-request an id (connection and number) and every batch of a scan's frames one (job and first file).
-Its requests to the projector carry that id.
+Lines of both servers carry the id of the request that is being worked on. The twin gives
+every request an id (connection and number) and every batch of a scan's frames one (job
+and first file). Its requests to the projector carry that id.
 """
 
 from __future__ import annotations
@@ -56,7 +56,8 @@ LEVELS = {name.lower(): level for name, level in logging.getLevelNamesMapping().
 
 
 class JsonLines(logging.Formatter):
-    """Formats a record as one JSON object: time, level, event, facts, and the traceback if any."""
+    """Formats a record as one JSON object: time, level, event, facts, and the
+    traceback if any."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Format a record as one line of JSON."""
@@ -73,8 +74,8 @@ class JsonLines(logging.Formatter):
 
 
 class Apart(QueueHandler):
-    """Writes records from a thread of its own, so that a blocked reader of the log blocks
-    nobody.
+    """Writes records from a thread of its own, so that a blocked reader of the
+    log blocks nobody.
 
     Args:
         target: formats and writes.
@@ -137,12 +138,12 @@ def log(event: str, level: int = logging.INFO, *, error: bool = False, **facts: 
 class Sparing:
     """Limits lines that others cause: the first of each kind, then one at intervals.
 
-    A line that is written after others of its kind were left out says how many
+    A line that is written after others of its kind were left out has their number
     (`left_out`).
 
     Args:
         burst: lines of a kind written at once.
-        clock: tells the time [s].
+        clock: returns the time [s].
     """
 
     def __init__(self, burst: int = BURST, clock: Callable[[], float] = time.monotonic) -> None:
@@ -181,7 +182,7 @@ def set_up(stream: TextIO = sys.stderr, level: int = logging.INFO, *, apart: boo
     Args:
         stream: where to.
         level: least level that is written.
-        apart: write from a thread; what libraries complain of goes to the log too (a server's
+        apart: write from a thread; warnings of libraries go to the log too (a server's
             main).
     """
     handler: logging.Handler = logging.StreamHandler(stream)

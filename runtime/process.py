@@ -1,13 +1,14 @@
-"""Event loop, sockets, signals, `ready` line, exit codes and processor time of server processes.
+"""Event loop, sockets, signals, `ready` line, exit codes and processor time
+of server processes.
 
-Every request, an E-stop too, waits for the turn of the loop under way. The time from where the loop
-wakes up to where it polls its sockets again is therefore measured for every turn. It includes the
-time that another thread holds the interpreter while the loop has work to do. asyncio's complaints
-go to the log.
+Every request, an E-stop too, waits for the turn of the loop under way. The time from
+where the loop wakes up to where it polls its sockets again is therefore measured for
+every turn. It includes the time that another thread holds the interpreter while the loop
+has work to do. asyncio's complaints go to the log.
 
-How servers listen and the options of their sockets are here, too: no delay of small messages, and
-dead peers noticed in a minute. The `main` modules of the processes say what they serve and with
-which options.
+How servers listen and the options of their sockets are here, too: no delay of small
+messages, and dead peers noticed in a minute. The `main` modules of the processes declare
+their services and options.
 """
 
 from __future__ import annotations
@@ -110,8 +111,8 @@ class _Watched(selectors.DefaultSelector):
 class ServerLoop(asyncio.SelectorEventLoop):
     """asyncio's loop with its turns measured; its complaints go to the log at a limited rate.
 
-    Without the limit a process that has run out of descriptors would flood its log, since every
-    connection that cannot be accepted is an error.
+    Without the limit a process that has run out of descriptors would flood its log, since
+    every connection that cannot be accepted is an error.
     """
 
     def __init__(self) -> None:
@@ -237,8 +238,8 @@ T = TypeVar("T")
 
 
 def stop_signal() -> asyncio.Event:
-    """Make an event that SIGTERM or SIGINT sets; a second signal does not interrupt the
-    stopping."""
+    """Make an event that SIGTERM or SIGINT sets; a second signal does not
+    interrupt the stopping."""
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in SIGNALS:
@@ -257,14 +258,13 @@ async def first_of(*events: asyncio.Event) -> None:
 
 
 def announce(server: str, facts: Mapping[str, object], out: TextIO | None = None) -> None:
-    """Print the JSON line that says the server is ready, with its process id; freeze
-    garbage collection."""
+    """Print the JSON line of a ready server, with its process id; freeze garbage collection."""
     loop = asyncio.get_running_loop()
     if isinstance(loop, ServerLoop):
         # What is there now stays: looking through it for garbage would take 0.1 s each time.
         gc.collect()
         gc.freeze()
-        loop.holds.begin()  # until here nobody has waited for it
+        loop.holds.begin()  # no client has waited for it yet
     print(json.dumps({"ready": server, **facts, "pid": os.getpid()}), file=out, flush=True)
 
 
@@ -313,7 +313,7 @@ def _allow_descriptors() -> None:
         return
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     most = MAX_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, MAX_DESCRIPTORS)
-    with contextlib.suppress(OSError, ValueError):  # macOS allows fewer than it says
+    with contextlib.suppress(OSError, ValueError):  # macOS allows fewer than it reports
         resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, most), hard))
 
 
@@ -332,16 +332,16 @@ def read_if_there(file: Path | None, parse: Callable[[str, str], T]) -> T | None
 def process_seconds(pid: int) -> float | None:
     """Return the processor time of a process so far, with its children that have ended [s].
 
-    A busy machine gives a process less of its processors, not less to do: what bounds
-    work is the time that the work itself has used. None where the system does not tell.
+    A busy machine gives a process less of its processors, not less to do: the limit of
+    work is the time that the work itself has used. None if the system does not report it.
     """
     words = _words(str(pid))
     return _seconds(words) if words else None
 
 
 def session_seconds(session: int) -> float | None:
-    """Sum up the processor time of the processes of a session so far [s]; None as
-    `process_seconds`.
+    """Sum up the processor time of the processes of a session so far [s];
+    None as `process_seconds`.
 
     Args:
         session: its number, which is the process id of its first process.

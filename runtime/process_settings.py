@@ -1,6 +1,7 @@
 """The settings of each server process, and the values that their words stand for.
 
-Each process has a frozen dataclass of settings; what is derived from it: `flexdt.runtime.settings`.
+Each process has a frozen dataclass of settings; what is derived from it:
+`flexdt.runtime.settings`.
 """
 
 # ruff: noqa: RUF009  (the calls make fields; they are not values shared by all instances)

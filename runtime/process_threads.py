@@ -1,11 +1,12 @@
 """Kernel threads in a process: they sleep while they wait, and a forked child computes alone.
 
-GNU OpenMP reads its environment once, when it is loaded. By default its threads spin at the end of
-each parallel loop; beside other programs they take the cores from the thread that they wait for.
+GNU OpenMP reads its environment once, when it is loaded. By default its threads spin at
+the end of each parallel loop; beside other programs they take the cores from the thread
+that computes.
 
-A fork copies the calling thread alone. GNU OpenMP ends a process that starts a parallel loop after
-a fork of a process that had started one, so parallel loops of such a child run in its own thread.
-Processes started by `spawn` or `forkserver` use all cores.
+A fork copies the calling thread alone. GNU OpenMP ends a process that starts a parallel
+loop after a fork of a process that had started one, so parallel loops of such a child run
+in its own thread. Processes started by `spawn` or `forkserver` use all cores.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ DEVICE: Final = "flexdt.twin.projection.gpu"
 
 
 def load_sleeping() -> str:
-    """Load OpenMP with threads that sleep while they wait, unless the user chose or it is
-    loaded.
+    """Load OpenMP with threads that sleep while they wait, unless the user chose or
+    it is loaded.
 
     The environment is then as it was: other libraries and child processes keep their
     defaults.
@@ -57,8 +58,8 @@ def load_sleeping() -> str:
 
 
 def _in_child() -> None:
-    """Restrict a forked child to one thread if the parent had kernel threads, and to no
-    device."""
+    """Restrict a forked child to one thread if the parent had kernel threads, and
+    to no device."""
     gpu = sys.modules.get(DEVICE)
     if gpu is not None:
         gpu.leave_after_fork()

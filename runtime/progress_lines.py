@@ -1,4 +1,4 @@
-"""Who waits for work that takes seconds hears every two of them what is done."""
+"""Progress of work that takes seconds, reported every two of them."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from contextlib import contextmanager
 SILENT_S = 2.0
 """Interval of progress lines [s]."""
 _last = [0.0, 0.0]
-"""Times of the newest line and of the end of the newest work [s]: kernels compile one by
-one."""
+"""Times of the newest line and of the end of the newest work [s]: kernels compile
+one by one."""
 
 
 @contextmanager

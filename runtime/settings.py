@@ -1,8 +1,8 @@
 """Settings declared once: fields of a frozen dataclass, with their help, bounds and defaults.
 
-The options of `python -m flexdt....main`, the keys of a table of the settings file, and the words
-that a process is started with are all derived from the declaration. Servers and command line both
-import this module, so it stands above their two packages.
+The options of `python -m flexdt....main`, the keys of a table of the settings file, and
+the words that a process is started with are all derived from the declaration. Servers and
+command line both import this module, so it is above their two packages.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ S = TypeVar("S", bound=Settings)
 
 
 def option(default: object, *flags: str, public: bool = True, **details: Any) -> Any:
-    """Declare a field of settings that is an option; its help is what the class's
-    docstring says of it.
+    """Declare a field of settings that is an option; its help is its text in
+    the class's docstring.
 
     Args:
         default: where the option is left out.
@@ -84,7 +84,7 @@ def has_parameters(command: Callable[..., Any], shown: Iterable[inspect.Paramete
 
 
 def read(settings: type[S], words: Sequence[str] | None = None) -> S | None:
-    """Read settings from words; None if they asked for the help, which is shown.
+    """Read settings from words; None after the help, which is printed.
 
     Args:
         settings: class of the process or command.
@@ -96,7 +96,7 @@ def read(settings: type[S], words: Sequence[str] | None = None) -> S | None:
     found: dict[str, Any] = {}
 
     def take(**given: Any) -> None:
-        """Store what typer has read."""
+        """Store the values that typer has read."""
         found.update({n: tuple(v) if isinstance(v, list) else v for n, v in given.items()})
 
     has_parameters(take, parameters(settings).values())
@@ -140,7 +140,7 @@ def words(given: Mapping[str, object]) -> list[str]:
 
 
 def shared(settings: Settings, other: type[Settings]) -> dict[str, object]:
-    """Return the values of `settings` that a process with settings `other` takes too, by
-    name."""
+    """Return the values of `settings` that a process with settings `other` takes
+    too, by name."""
     mine = {f.name for f in fields(settings)}
     return {f.name: getattr(settings, f.name) for f in fields(other) if f.name in mine}

@@ -1,14 +1,15 @@
 """Start several server processes in order, keep them alive, stop them all: no orphans.
 
-Each service prints one JSON `ready` line with its address on standard output; later services get
-the addresses of earlier ones. One whose start takes long prints the same as `bound` before, so that
-later ones start meanwhile. A service that ends, or is killed at any moment, is started again for
-ever on the address it had, with pauses that grow up to half a minute; it never ends the others.
-Only one that leaves by itself at its very first start ends them all: somebody has to look at its
-options. A start may take as long as it works (compiling takes minutes on a busy machine): only one
-that uses no processor time for `STALLED_S` is ended. Services run in sessions of their own, so
-Ctrl-C reaches only the supervisor, which stops them in reverse order; should the supervisor itself
-be killed, their standard input closes and they stop (see `child`).
+Each service prints one JSON `ready` line with its address on standard output; later
+services get the addresses of earlier ones. One whose start takes long prints the same as
+`bound` before, so that later ones start meanwhile. A service that ends, or is killed at
+any moment, is started again for ever on the address it had, with pauses that grow up to
+half a minute; it never ends the others. Only one that leaves by itself at its very first
+start ends them all: its options need attention. A start may take as long as it works
+(compiling takes minutes on a busy machine): only one that uses no processor time for
+`STALLED_S` is ended. Services run in sessions of their own, so Ctrl-C reaches only the
+supervisor, which stops them in reverse order; should the supervisor itself be killed,
+their standard input closes and they stop (see `child`).
 """
 
 from __future__ import annotations
@@ -53,8 +54,9 @@ class Service:
 
     Attributes:
         name: as in its `ready` line.
-        command: addresses known so far (its own too, after a first start) -> module and arguments.
-        slow: why a start may take long, for somebody who waits.
+        command: addresses known so far (its own too, after a first start) -> module and
+            arguments.
+        slow: reason for a slow start, for the user.
     """
 
     name: str
@@ -63,7 +65,7 @@ class Service:
 
 
 class ServiceError(Exception):
-    """A service left by itself at its first start; the message says which and how.
+    """A service left by itself at its first start; the message names it and its exit.
 
     Attributes:
         exit_code: the service's own, where it is not 0, else 1.
@@ -189,7 +191,7 @@ class Supervisor:
         try:
             process = await asyncio.create_subprocess_exec(
                 sys.executable,
-                "-P",  # the installed package, not what the current folder has of that name
+                "-P",  # the installed package, not a folder of that name
                 "-m",
                 "flexdt.runtime.child",
                 *service.command(dict(self.addresses)),
@@ -204,10 +206,10 @@ class Supervisor:
         return process
 
     async def _ready(self, process: Process, start: _Start) -> None:
-        """Wait until a service is ready; report what is waited for and how far it has come.
+        """Wait until a service is ready; report the wait and the progress.
 
         Raises:
-            _Ended: before it said so, or it no longer does anything.
+            _Ended: before it was ready, or it no longer does anything.
         """
         clock = asyncio.get_running_loop().time
         service = start.service
@@ -287,7 +289,8 @@ class Supervisor:
 
 
 class _Ended(Exception):
-    """A process ended, or never began; the message says how, `returncode` where it has one."""
+    """A process ended, or never began; the message names the exit, `returncode` its code
+    if there is one."""
 
     def __init__(self, how: str, returncode: int | None = None) -> None:
         super().__init__(how)
@@ -314,8 +317,8 @@ async def _unless_one_ends(event: asyncio.Event, keepers: Sequence[asyncio.Task[
 
 
 async def _drained(process: Process) -> int:
-    """Read the pipe until the process ends, so that printing never blocks; return its
-    exit code."""
+    """Read the pipe until the process ends, so that printing never blocks; return
+    its exit code."""
     drain = asyncio.create_task(_drain(process))
     try:
         return await _ended(process)
@@ -332,7 +335,7 @@ async def _drain(process: Process) -> None:
 
 
 async def _ended(process: Process) -> int:
-    """Wait for the end of a process alone, not of those who inherited its pipes; return
+    """Wait for the end of a process alone, not of its children with the same pipes; return
     its exit code."""
     end = asyncio.create_task(process.wait())
     try:

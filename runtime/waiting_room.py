@@ -1,8 +1,9 @@
-"""Connections without a place, at every port: who stays where too many come.
+"""Connections without a place, at every port: which of too many stay.
 
-A connection waits in a `Room` until it has shown what its port wants: the token, or without one a
-request that is served. A newcomer always gets in, so that it can say what it is; what it displaces
-belongs to the address that has most there.
+A connection waits in a `Room` until it has shown the token, if its port has one, or a
+request that is served: the token, or without one a request that is served. A newcomer
+always gets in, so that it can identify itself; it displaces one of the address that has
+most there.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import Final, Generic, Protocol, TypeVar
 WAITING: Final = 512
 """Largest number of connections of a port that wait.
 
-Where one address opens 167 a second, each of them still has 3 s to say what it is.
+Where one address opens 167 a second, each of them still has 3 s to identify itself.
 """
 
 
@@ -34,8 +35,8 @@ _G = TypeVar("_G", bound=Guest)
 class Room(Generic[_G]):
     """Connections without a place, in the order in which they came.
 
-    Where it is full, the oldest connection of the address that has most goes. A newcomer thus
-    always gets in, and an address with many connections displaces its own.
+    Where it is full, the oldest connection of the address that has most goes. A newcomer
+    thus always gets in, and an address with many connections displaces its own.
 
     Args:
         most: connections.
@@ -60,8 +61,8 @@ class Room(Generic[_G]):
 
 
 def neighbourhood(host: str) -> str:
-    """Return the address for a share: an IPv4 address, or the 64 bits of an IPv6 network
-    (one owner's)."""
+    """Return the address for a share: an IPv4 address, or the 64 bits of an IPv6
+    network (one owner's)."""
     try:
         address = ipaddress.ip_address(host.partition("%")[0])
     except ValueError:

@@ -1,7 +1,7 @@
 """The twin's exceptions as the wire's errors: one table, most special types first.
 
-What no user caused stays an internal error, with its traceback in the server's log and nowhere
-else.
+Errors that no user caused stay internal, with their traceback in the server's log and
+nowhere else.
 """
 
 from __future__ import annotations

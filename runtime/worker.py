@@ -1,8 +1,9 @@
 """`python -m flexdt.runtime.worker SOCKET MEMORY`: heavy work, in a process of its own.
 
-Requests and answers are lists of byte strings over a socket that the parent handed down. The
-process has a limit on memory, one on processor time for each request, a low priority, and ends when
-its parent does. A request is a pickled call of a module-level function, and what it takes as it is.
+Requests and answers are lists of byte strings over a socket that the parent handed down.
+The process has a limit on memory, one on processor time for each request, a low priority,
+and ends when its parent does. A request is a pickled call of a module-level function, and
+its raw arguments.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ def send_parts(channel: socket.socket, parts: Parts) -> None:
 
 
 def receive_parts(channel: socket.socket) -> list[bytes]:
-    """Receive what `send_parts` sent.
+    """Receive a list sent by `send_parts`.
 
     Raises:
         EOFError: the other end is gone.
@@ -71,8 +72,7 @@ def limit(what: str, most: int) -> None:
 def peak_bytes() -> int:
     """Return the largest memory this process has taken so far [bytes].
 
-    Where Linux tells it: `ru_maxrss` begins with what the process had that started this
-    one.
+    By Linux's own figure: `ru_maxrss` begins with the memory of the parent.
     """
     try:
         with open("/proc/self/status", encoding="ascii") as status:
@@ -84,7 +84,7 @@ def peak_bytes() -> int:
 def answer(request: Sequence[bytes]) -> list[bytes]:
     """Do one piece of work; return its parts after b"done", or how it failed."""
     seconds, call, *raw = request
-    # Before the call is read, which imports what it needs.
+    # Before the call is unpickled, which imports modules.
     limit("RLIMIT_CPU", int(sum(os.times()[:2]) + float(seconds) + 2.0))
     try:
         work, arguments = pickle.loads(call)
@@ -103,8 +103,8 @@ def answer(request: Sequence[bytes]) -> list[bytes]:
 def document(read: Callable[..., Any], how: Mapping[str, str], raw: bytes) -> list[bytes]:
     """Read untrusted bytes by `read` in the worker, and return JSON; no file may be written.
 
-    Here, and not beside the server's store, so that the process loads only what `read`
-    needs.
+    Here, and not beside the server's store, so that the process loads only the modules of
+    `read`.
     """
     limit("RLIMIT_FSIZE", 0)
     return [json.dumps(read(raw, **how).to_dict()).encode()]

@@ -1,8 +1,8 @@
 """Processes for heavy work: parsing, planning, sweeping, strangers' files (see `worker`).
 
-A process is started when it is first needed and kept for a while. It is replaced after work that
-took much memory, and ended when its work takes too long, dies, or is no longer wanted; that costs
-whoever asked an error, and nobody else anything.
+A process is started when it is first needed and kept for a while. It is replaced after
+work that took much memory, and ended when its work takes too long, dies, or is no longer
+wanted; only the requester gets an error.
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ class Worker:
         )
 
     def stop(self) -> None:
-        """End the process without waiting for it; whoever awaits its answer gets an error."""
+        """End the process without waiting for it; the requester gets an error."""
         self.kept = False
         self._process.kill()
 
@@ -198,7 +198,9 @@ class Workers:
                 return await asyncio.shield(asked)
             except asyncio.CancelledError:
                 worker.stop()
-                asked.add_done_callback(lambda asked: asked.exception())  # nobody else will hear it
+                asked.add_done_callback(
+                    lambda asked: asked.exception()
+                )  # retrieved, so that asyncio does not log it
                 raise
             finally:
                 self._keep(worker)

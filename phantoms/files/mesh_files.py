@@ -1,7 +1,8 @@
 """Phantoms from meshes and grids of the user's own: mesh files, voxel arrays.
 
-Files come from outside: format, size and content are checked before and after parsing, nothing is
-unpickled, and references to other files are not followed. A mesh must be closed.
+Files come from outside: format, size and content are checked before and after parsing,
+nothing is unpickled, and references to other files are not followed. A mesh must be
+closed.
 """
 
 from __future__ import annotations
@@ -82,10 +83,10 @@ def mesh_phantom(
 
     Args:
         source: the bytes of an STL, OBJ, PLY, GLB or OFF file, or its path. Bodies of a
-            GLB scene are taken together, each where it stands.
+            GLB scene are joined at their places.
         unit: length unit of the file's numbers: um, mm, cm, m, inch; default: that of the
             format, m for GLB, and mm where it has none.
-        material: what fills it.
+        material: the material.
         file_type: one of `FORMATS`; default: by the path's suffix (bytes need it).
         name: default: the path's stem, or "mesh".
         place: "center" puts the middle of its box on the axis at the reference height;
@@ -98,7 +99,7 @@ def mesh_phantom(
         are projected exactly.
 
     Raises:
-        PhantomError: format, size, unit or content; says what is allowed.
+        PhantomError: format, size, unit or content; the message lists the allowed values.
         UnknownNameError: unknown material.
 
     Example:
@@ -138,8 +139,7 @@ def filled_mesh(
         mesh: its triangles; not changed.
         unit, material, name, place: as for `mesh_phantom`.
         label: of the mesh, for errors.
-        at_mm: where its middle, or the origin it keeps, comes to lie in the object's
-            frame [mm].
+        at_mm: place of its middle, or of the origin it keeps, in the object's frame [mm].
 
     Raises:
         PhantomError, UnknownNameError: as `mesh_phantom`.
@@ -182,7 +182,7 @@ def read_mesh(source: bytes | str | os.PathLike[str]) -> trimesh.Trimesh:
     """Read the triangles of a file, closed, wound outwards, in its own units.
 
     Raises:
-        PhantomError: format, size or content; says what is allowed.
+        PhantomError: format, size or content; the message lists the allowed values.
     """
     raw, kind, label = _read(source, None)
     return _closed(_parse(raw, kind), label)
@@ -193,7 +193,8 @@ def read_part(path: str | os.PathLike[str]) -> trimesh.Trimesh:
     may be open.
 
     Raises:
-        PhantomError: no such file, its format, size or content; says what is allowed.
+        PhantomError: no such file, its format, size or content; the message lists the
+            allowed values.
     """
     kind = Path(path).suffix.lstrip(".").lower()
     if kind not in PART_FORMATS:
@@ -234,8 +235,8 @@ def voxel_phantom(
         data: [z, y, x], attenuation [1/mm].
         voxel_mm: voxel edge, one or along x, y, z [mm].
         name: its name.
-        center_mm: where the grid's centre lies in the object's frame [mm].
-        material: what it is made of, for its spectrum: a voxel's amount is its
+        center_mm: place of the grid's centre in the object's frame [mm].
+        material: its material, for its spectrum: a voxel's amount is its
             attenuation over the material's. None: water of varying density.
 
     Raises:
@@ -262,8 +263,8 @@ def voxel_phantom(
 
 
 def _read(source: bytes | str | os.PathLike[str], file_type: str | None) -> tuple[bytes, str, str]:
-    """Read a file, or take bytes; return content, format and label, with size and format
-    checked."""
+    """Read a file, or take bytes; return content, format and label, with size
+    and format checked."""
     if isinstance(source, bytes):
         raw = source
         label = "mesh"
@@ -309,7 +310,7 @@ def _parse(raw: bytes, kind: str) -> trimesh.Trimesh:
     try:
         if kind in _CHECKS:
             _CHECKS[kind](raw)
-        # Parts that lie too far away are refused below, as vertices that are not finite.
+        # Parts that are too far away are rejected below, as vertices that are not finite.
         with np.errstate(all="ignore" if kind == "glb" else None):
             mesh = trimesh.load(
                 io.BytesIO(raw),
@@ -336,8 +337,8 @@ def _parse(raw: bytes, kind: str) -> trimesh.Trimesh:
 
 
 def _check_ply(raw: bytes) -> None:
-    """Check that the header is there, small, and claims no more elements than there are
-    bytes."""
+    """Check that the header is there, small, and claims no more elements than
+    there are bytes."""
     end = raw.find(b"end_header", 0, MAX_PLY_HEADER)
     if not raw.startswith(b"ply") or end < 0:
         raise ValueError(f"no PLY header within {MAX_PLY_HEADER} bytes")
@@ -353,7 +354,7 @@ def _check_glb(raw: bytes) -> None:
     """Check that the file refers to no other, claims no more than it holds, and puts each
     node in one place.
 
-    trimesh allocates what the document claims, and copies a mesh to each of its places.
+    trimesh allocates the claimed memory, and copies a mesh to each of its places.
     """
     if len(raw) < 20 or raw[:8] != b"glTF\2\0\0\0" or raw[16:20] != b"JSON":
         raise ValueError("it does not begin as a GLB file (glTF 2.0) does")
@@ -446,8 +447,9 @@ def _closed(mesh: trimesh.Trimesh, label: str) -> trimesh.Trimesh:
 def _wound(faces: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     """Turn faces so that neighbours agree, in each body the way most of its faces already are.
 
-    Every face has two nodes, as it is and turned; neighbours link those that agree. A body then
-    falls into two components, mirror images of each other, and either is a consistent choice.
+    Every face has two nodes, as it is and turned; neighbours link those that agree. A
+    body then falls into two components, mirror images of each other, and either is a
+    consistent choice.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components

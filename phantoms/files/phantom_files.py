@@ -1,12 +1,12 @@
 """Phantom files, TOML or JSON: bead phantoms, scenes of several materials, and saved phantoms.
 
-A bead file names a body and its beads, or requests a spiral of beads. A scene file lists solids and
-meshes with their materials. The JSON of `Phantom.to_dict` is read as well. Unknown keys are errors,
-so that a typing error is noticed.
+A bead file names a body and its beads, or requests a spiral of beads. A scene file lists
+solids and meshes with their materials. The JSON of `Phantom.to_dict` is read as well.
+Unknown keys are errors, so that a typing error is noticed.
 
-A file that a client sends is held to what collisions and images can bear. It may say anything of
-its size, and its solids may be many: the size is worked out from the content, and solids, triangles
-and extent are bounded.
+A file from a client is limited to content that collisions and images can bear. Its stated
+size is not trusted, and its solids may be many: the size is worked out from the content,
+and solids, triangles and extent are bounded.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def read_phantom_file(path: Path) -> Phantom:
     """Read the phantom of a TOML or JSON file; meshes that a scene names are beside it.
 
     Raises:
-        PhantomError: names file, key path, value and what is allowed.
+        PhantomError: names file, key path, value and allowed values.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -67,7 +67,7 @@ def load_phantom_file(text: str, file: str = "<phantom>", folder: Path | None = 
         folder: of the meshes that a scene names; without one, naming a mesh is an error.
 
     Raises:
-        PhantomError: names file, key path, value and what is allowed.
+        PhantomError: names file, key path, value and allowed values.
     """
     try:
         text = text.removeprefix(BYTE_ORDER_MARK)
@@ -81,8 +81,8 @@ def load_phantom_file(text: str, file: str = "<phantom>", folder: Path | None = 
 
 
 def phantom_of(document: Mapping[str, object], folder: Path | None = None) -> Phantom:
-    """Make the phantom of a document in any of the three forms; raises as
-    `load_phantom_file`."""
+    """Make the phantom of a document in any of the three forms;
+    raises as `load_phantom_file`."""
     if "scene" in document:
         return Phantom.from_dict(document)
     if "solid" in document or "mesh" in document:
@@ -273,7 +273,8 @@ def sent_scene(text: bytes, *, name: str) -> Phantom:
         name: the phantom gets; also for errors.
 
     Raises:
-        PhantomError, UnknownNameError: names the key path, the value and what is allowed.
+        PhantomError, UnknownNameError: names the key path, the value and the allowed
+            ones.
     """
     try:
         document = text.decode("utf-8")

@@ -1,4 +1,4 @@
-"""Shells of a mesh that lie inside others: cavities, or bodies counted once with what is around."""
+"""Shells of a mesh inside others: cavities, or bodies counted once with their surroundings."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Faces = npt.NDArray[Any]
 
 
 def filled_twice(vertices: FloatArray, faces: Faces) -> int:
-    """Count the shells turned outwards inside what other shells fill.
+    """Count the shells turned outwards inside other filled shells.
 
     Such a shell changes nothing: where bodies overlap, path counts once. Cavities turn
     inwards.

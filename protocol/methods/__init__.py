@@ -46,8 +46,8 @@ def find(name: str, methods: Mapping[str, AnyMethod] = METHODS) -> AnyMethod:
 def openrpc_document(
     methods: Mapping[str, AnyMethod] = METHODS, *, title: str = "flexdt twin server"
 ) -> dict[str, Any]:
-    """Make the OpenRPC document of a server as plain data (https://spec.open-rpc.org,
-    version 1.3).
+    """Make the OpenRPC document of a server as plain data
+    (https://spec.open-rpc.org, version 1.3).
 
     Args:
         methods: method table of the server.

@@ -1,7 +1,7 @@
 """scene.* and rpc.discover: the whole state, and the wire itself, as documents.
 
-The units of a scene are those of the wire: mm, deg, kV, W, ms. The hidden misalignment is not part
-of it.
+The units of a scene are those of the wire: mm, deg, kV, W, ms. The hidden misalignment is
+not part of it.
 """
 
 from __future__ import annotations

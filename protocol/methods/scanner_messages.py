@@ -1,4 +1,5 @@
-"""axes.*, safety.*, clock.set, tube.set, camera.set and sample.*: motors, settings, the sample."""
+"""axes.*, safety.*, clock.set, tube.set, camera.set and sample.*: motors,
+settings, the sample."""
 
 from __future__ import annotations
 

@@ -47,8 +47,8 @@ _IMAGE: Final = re.compile(r"(di|io|scan)[_-]?(\d+)\.tiff?", re.IGNORECASE)
 
 @dataclass(frozen=True)
 class Frame:
-    """One projection: index in the scan, file name, path (None in memory), whether it exists,
-    (rows, cols)."""
+    """One projection: index in the scan, file name, path (None in memory), whether it
+    exists, (rows, cols)."""
 
     index: int
     file: str
@@ -171,8 +171,8 @@ _confined: Directory | None = None
 def confined(root: Directory) -> Iterator[None]:
     """Ensure that, inside, this process reads nothing below `root` through a link.
 
-    A user's own folders may well have links in them; what strangers ask a server for may
-    not.
+    A user's own folders may well have links in them; paths that strangers request of a
+    server may not.
     """
     global _confined
     before = _confined
@@ -311,7 +311,7 @@ def _decoded(path: Path, kinds: str) -> npt.NDArray[np.uint16 | np.float32]:
     """
     import tifffile
 
-    # A file may name others as its images, wherever they are: only what is in it is read.
+    # A file may name others as its images, wherever they are: only the file itself is read.
     with opened(path) as raw, tifffile.TiffFile(raw, _multifile=False) as file:
         series = file.series[0]
         shape = tuple(series.shape)
@@ -359,7 +359,7 @@ def _check_inflation(path: Path, raw: BinaryIO, page: Any, size: int) -> None:
 def blank_images(folder: Folder, names: Sequence[str]) -> tuple[str, ...]:
     """List those of the images that are all zeros; none if the last one is not.
 
-    They are what a scan that was stopped leaves of files that were made in advance.
+    A stopped scan leaves such images if the files were made in advance.
     """
     there = [name for name in names if name in folder.names]
     if not there or not _blank(folder.path / there[-1]):
@@ -377,7 +377,7 @@ def _blank(path: Path) -> bool:
                 return False
         return not read_values(path).any()
     except (OSError, ds.DatasetError):
-        return False  # who reads it is told
+        return False  # the reader gets the error
 
 
 def mean_image(paths: Sequence[Path], shape: tuple[int, int]) -> Float32Array:
@@ -389,8 +389,8 @@ def mean_image(paths: Sequence[Path], shape: tuple[int, int]) -> Float32Array:
 
 
 def tiff_bytes(image: npt.NDArray[np.uint16]) -> bytes:
-    """Encode one uint16 image (rows, cols) as a baseline TIFF: little-endian, one strip,
-    no metadata.
+    """Encode one uint16 image (rows, cols) as a baseline TIFF: little-endian, one
+    strip, no metadata.
 
     The pixels begin at byte 8 and the tags follow them, as the scanner writes its files:
     some of its readers look for pixels there without reading the tags.

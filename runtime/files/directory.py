@@ -1,13 +1,13 @@
 """A directory that is reached by its descriptor, so that no link below it is ever followed.
 
-The path of the topmost directory is its owner's, who may well have put links into it. Everything
-below is opened one component after the other, relative to the descriptor of the directory above it:
-a link that somebody plants there, even between two calls, is an error that names it or an entry
-like any other. Only regular files are opened.
+The path of the topmost directory belongs to its owner, who may use links in it.
+Everything below is opened one component after the other, relative to the descriptor of
+the directory above it: a link that is planted there, even between two calls, is an error
+that names it or an entry like any other. Only regular files are opened.
 
-A file is written under a temporary name, flushed to the disk, and renamed, so that it appears under
-its own name only when whole. All methods may be called from several threads. Systems that open no
-directories (Windows) get paths instead.
+A file is written under a temporary name, flushed to the disk, and renamed, so that it
+appears under its own name only when complete. All methods may be called from several
+threads. Systems that open no directories (Windows) get paths instead.
 """
 
 from __future__ import annotations
@@ -56,12 +56,12 @@ Write = Callable[[int, memoryview], int]
 
 @contextmanager
 def writing(path: Path, refused: str) -> Iterator[None]:
-    """Convert the system's errors inside to `DatasetWriteError`, for a full disk to
-    `DiskFullError`.
+    """Convert the system's errors inside to `DatasetWriteError`, for a full
+    disk to `DiskFullError`.
 
     Args:
-        path: of what is written.
-        refused: what cannot be done, for the message.
+        path: of the written file.
+        refused: the failed operation, for the message.
     """
     try:
         yield
@@ -82,8 +82,8 @@ class Directory:
 
     Args:
         path: of the directory; it must exist.
-        sync: flush every file to the disk before it gets its name; without it a power cut may
-            leave an empty file, a killed process never does.
+        sync: flush every file to the disk before it gets its name; without it a power cut
+            may leave an empty file, a killed process never does.
         write: writes bytes to a descriptor and returns how many (tests let it fail).
         above: the directory it is in, see `folder`; None for the topmost.
 
@@ -114,7 +114,7 @@ class Directory:
     def folder(self, name: str, *, sync: bool = True, write: Write = write_some) -> Directory:
         """Return the directory called `name` in this one, which need not exist yet.
 
-        It is opened anew for every call, unless it is `held`.
+        It is opened for every call, unless it is `held`.
         """
         return Directory(self.path / name, sync=sync, write=write, above=self)
 
@@ -126,7 +126,8 @@ class Directory:
         """Hold it open: whatever its name refers to later, it stays this directory.
 
         Raises:
-            DatasetWriteError: there is no such directory, or a link stands there.
+            DatasetWriteError: there is no such directory, or there is a link in its
+                place.
         """
         assert self._above is not None
         with writing(self.path, f"cannot use folder {self.path}"):
@@ -138,7 +139,7 @@ class Directory:
         """Make the directory if it is missing; safe from a power cut when this returns.
 
         Raises:
-            DatasetNameError: a link or a file stands there.
+            DatasetNameError: there is a link or a file in its place.
             DatasetWriteError: the system refuses.
         """
         if self._above is None:
@@ -200,8 +201,8 @@ class Directory:
             os.close(file)
 
     def allocate(self, name: str, size: int) -> None:
-        """Make a file of `size` bytes whose blocks are reserved on the disk, in place of
-        its namesake.
+        """Make a file of `size` bytes whose blocks are reserved on the disk, in
+        place of its namesake.
 
         Raises:
             OSError: the system refuses, as for want of room; then there is no such file.
@@ -233,8 +234,7 @@ class Directory:
         """Open a regular file for reading.
 
         Raises:
-            OSError: there is none: a FileNotFoundError, or what stands there is another
-                thing.
+            OSError: there is none: a FileNotFoundError, or it is no regular file.
         """
         with self._opened() as fd:
             try:
@@ -338,8 +338,8 @@ class Directory:
                 os.close(own)
 
     def names(self) -> set[str]:
-        """List the names of the complete, regular files in it; none without such a
-        directory."""
+        """List the names of the complete, regular files in it; none without
+        such a directory."""
         with suppress(FileNotFoundError, NotADirectoryError), self.entries() as entries:
             return {
                 e.name
@@ -357,8 +357,8 @@ class Directory:
                     self.unlink(name)
 
     def sync(self) -> None:
-        """Make the names safe: before that a power cut may undo the last changes of the
-        directory.
+        """Make the names safe: before that a power cut may undo the last
+        changes of the directory.
 
         Raises:
             DatasetWriteError: the system refuses.
@@ -415,8 +415,8 @@ class Directory:
             return os.open(above._at(self.path.name), _DIRECTORY | _NO_FOLLOW, dir_fd=fd)
 
     def _at(self, name: str) -> str:
-        """Check that `name` is one component; return it for a call that takes the
-        descriptor, too."""
+        """Check that `name` is one component; return it for a call that takes
+        the descriptor, too."""
         if name in ("", ".", "..") or "/" in name or "\0" in name:
             raise OSError(errno.EINVAL, "no name of an entry", name)
         if _RELATIVE:
@@ -433,8 +433,8 @@ class Directory:
                 return name, os.open(name, _NEW | flags, mode, dir_fd=fd)
 
     def _store(self, fd: int | None, name: str, data: memoryview) -> None:
-        """Write a file under a temporary name, flush it and rename it; nothing is left of
-        a failure."""
+        """Write a file under a temporary name, flush it and rename it; nothing is
+        left of a failure."""
         temporary, file = self._temporary(fd, 0o644)
         try:
             try:
@@ -494,7 +494,7 @@ def memory_bytes() -> int:
 def free_memory_bytes() -> int:
     """Estimate the memory that new work can have: free, or caching files [bytes].
 
-    Half of the memory is assumed to be free where the system does not say it (not Linux).
+    Half of the memory is assumed to be free if the system does not report it (not Linux).
     """
     free = memory_bytes() // 2
     with suppress(OSError, ValueError, KeyError):
@@ -516,10 +516,10 @@ def open_data(root: Path) -> Directory:
     """Open a twin's data directory, made if it is missing; check that files can be
     written into it.
 
-    A full disk is no hindrance: what must be written has room of its own (`spare_files`).
+    A full disk is no hindrance: state and jobs have room of their own (`spare_files`).
 
     Raises:
-        DatasetWriteError: they cannot; says why.
+        DatasetWriteError: they cannot; with the reason.
     """
     refused = f"the data directory {root} cannot be written"
     with writing(root, refused):

@@ -1,8 +1,9 @@
-"""Documents of ours: written whole and safe from a power cut, read with nothing taken on trust.
+"""Documents of ours: written atomically and safe from a power cut, validated when read.
 
-Any name becomes one plain path component. A document that is damaged (not JSON, numbers that are
-not finite, absurd values: whatever its reader does not accept) is set aside, as `x.unreadable.json`
-for `x.json`, with one line in the log, and whoever reads it does without.
+Any name becomes one plain path component. A document that is damaged (not JSON, numbers
+that are not finite, absurd values: whatever its reader does not accept) is set aside, as
+`x.unreadable.json` for `x.json`, with one line in the log, and the caller continues
+without it.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ ASIDE = ".unreadable"
 
 
 def file_stem(name: str) -> str:
-    """Encode `name` with percent signs as the stem of a file; different names give
-    different stems.
+    """Encode `name` with percent signs as the stem of a file; different names
+    give different stems.
 
     Raises:
         LimitError: it is too long for a file system.
@@ -53,8 +54,9 @@ class _Change:
     Attributes:
         folder, name: where it is.
         data: what is there now; None for nothing.
-        before: the name under which what was there is kept; None where nothing was, or is.
-        old: instead, what was there.
+        before: the name under which the replaced file is kept; None where nothing was, or
+            is.
+        old: instead, the replaced content.
         keep: writes it.
     """
 
@@ -97,8 +99,8 @@ class Changes:
         self._made: list[_Change] = []
 
     def put(self, folder: Directory, name: str, data: bytes, keep: Keep | None = None) -> None:
-        """Write a file like `Directory.keep`, and keep the one it replaces until `done`
-        or `undo`.
+        """Write a file like `Directory.keep`, and keep the one it replaces until
+        `done` or `undo`.
 
         Args:
             folder, name, data: directory, file name and content.
@@ -253,8 +255,8 @@ def settle(root: Directory, folders: Sequence[str]) -> None:
 
 
 def ours(folder: Directory) -> list[str]:
-    """List the names of JSON documents in a folder, links among them, except those set
-    aside."""
+    """List the names of JSON documents in a folder, links among them, except
+    those set aside."""
     with suppress(FileNotFoundError), folder.entries() as entries:
         names = sorted(e.name for e in entries if e.name.endswith(".json"))
         return [n for n in names if not n.endswith(f"{ASIDE}.json")]
@@ -270,12 +272,11 @@ def _finite(text: str) -> float:
 
 
 def lock_folder(root: Directory) -> Callable[[], None]:
-    """Lock a data directory until the end of the process, or a call of what is returned.
+    """Lock a data directory until the end of the process, or a call of the returned function.
 
-    The lock is on the directory itself, not on a file in it: there is nothing that
-    somebody could delete while a twin runs, or replace by a link beforehand. The system
-    releases it when its holder dies. Without effect where a directory cannot be opened
-    (Windows) or locked.
+    The lock is on the directory itself, not on a file in it: no file can be deleted while
+    a twin runs, or replaced by a link beforehand. The system releases it when its holder
+    dies. Without effect where a directory cannot be opened (Windows) or locked.
 
     Raises:
         DatasetWriteError: another process holds the lock.

@@ -1,11 +1,11 @@
-"""Room kept for what must be written: spare files, allocated in advance.
+"""Room reserved for state and jobs: spare files, allocated in advance.
 
-A document is written under a temporary name and renamed, as `Directory.put` does. Where the disk
-has no room for that, it is written into a spare file, whose blocks it has already, and that file
-takes the document's name. It keeps its size (spaces follow the document), so the file that it
-replaces becomes a spare file in turn, and there is no end of such writes. Spare files that are gone
-are made again as soon as there is room. File systems that never overwrite a block in place (btrfs,
-ZFS) may still refuse.
+A document is written under a temporary name and renamed, as `Directory.put` does. Where
+the disk has no room for that, it is written into a spare file, whose blocks it has
+already, and that file takes the document's name. It keeps its size (spaces follow the
+document), so the file that it replaces becomes a spare file in turn, and there is no end
+of such writes. Spare files that are gone are made again as soon as there is room. File
+systems that never overwrite a block in place (btrfs, ZFS) may still refuse.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Files that appear under their name only when they are whole, and room for them."""
+"""Files that appear under their name only when they are complete, and room for them."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pathlib import Path
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Yield a path to write; the file replaces `path` as a whole, and a failure leaves
-    nothing."""
+    """Yield a path to write; the file replaces `path` as a whole, and a
+    failure leaves nothing."""
     part = path.with_name(f".{path.name}.part")
     try:
         yield part
@@ -35,8 +35,8 @@ def nearest_there(path: Path) -> Path:
 
 
 def bytes_of(path: Path) -> int:
-    """Sum up the size of a file, or of all files in a folder, such as a volume in `.zarr`
-    [bytes]."""
+    """Sum up the size of a file, or of all files in a folder, such as a volume
+    in `.zarr` [bytes]."""
     files = (f for f in path.rglob("*") if f.is_file()) if path.is_dir() else iter([path])
     return sum(file.stat().st_size for file in files)
 

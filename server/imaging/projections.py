@@ -1,16 +1,18 @@
 """From nominal poses to line integrals: the one path on which the true geometry is used.
 
-Adds the hidden truth, transforms into the sample's frame, makes sure that the projector has the
-sample, and requests the projection. Images are the only results that depend on the truth: it is
-read once and never shown. Calibration is to find it, so no reply, log line, state, data set or
-printed form may carry it, and true geometries are handed out, never the parameters.
+Adds the hidden truth, transforms into the sample's frame, makes sure that the projector
+has the sample, and requests the projection. Images are the only results that depend on
+the truth: it is read once and never shown. Calibration is to find it, so no reply, log
+line, state, data set or printed form may carry it, and true geometries are handed out,
+never the parameters.
 
-A projector may serve several twins, whose samples may have equal names and different contents, so
-it knows each as `NAME #digest of the content`. Of a sample that changes, the version before the
-present one stays, for requests under way; older ones are removed.
+A projector may serve several twins, whose samples may have equal names and different
+contents, so it knows each as `NAME #digest of the content`. Of a sample that changes, the
+version before the present one stays, for requests under way; older ones are removed.
 
-Samples that have been taken apart stay in memory until others need it, the least recently used go
-first. What is on the stage, in a scan that has not ended, or being projected stays in any case.
+Samples that have been taken apart stay in memory until others need it, the least recently
+used go first. A sample on the stage, in a scan that has not ended, or being projected
+stays in any case.
 """
 
 from __future__ import annotations
@@ -92,10 +94,10 @@ def load_truth(path: Path, data: Path) -> TrueGeometry:
 
     Args:
         path: the file.
-        data: the data directory, in which it must not lie.
+        data: the data directory, which must not contain it.
 
     Raises:
-        MachineFileError: file, key, and what is allowed; no value of the file is repeated.
+        MachineFileError: file, key, and allowed values; no value of the file is repeated.
     """
     file = path.resolve()
     if file.is_relative_to(data.resolve()):
@@ -168,7 +170,7 @@ class Imaging:
     Attributes:
         projector: computes them.
         truth: hidden misalignment.
-        samples: what may stand on the stage.
+        samples: samples that may be on the stage.
         sensor: the detector.
         memory_limit: bytes of the samples that stay in memory; None for any.
         pinned: samples that stay in any case.
@@ -319,14 +321,15 @@ class Imaging:
             return self._scatterer[1]
 
     async def require_room(self, sample: Sample, pieces: Pieces) -> None:
-        """Check that a scan's sample fits into memory: here, beside what is pinned, and there.
+        """Check that a scan's sample fits into memory: here, in addition to the pinned
+        ones, and there.
 
         Args:
             sample: that the scan is to show.
             pieces: how the scan takes it apart.
 
         Raises:
-            RpcError: -32008, says what it takes and what there is.
+            RpcError: -32008, with the needed and the available memory.
         """
         if not sample.name:
             return
@@ -422,8 +425,8 @@ class Imaging:
                 del self._versions[name]
 
     async def _put(self, name: str, body: Body) -> str:
-        """Ensure that the projector has the present version of a body; return its name
-        there."""
+        """Ensure that the projector has the present version of a body; return
+        its name there."""
         named = f"{name} #{await asyncio.to_thread(digest_of, body)}"
         versions = self._versions.setdefault(name, [])
         if named not in versions:

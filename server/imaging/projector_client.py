@@ -1,7 +1,7 @@
 """The methods of one projector.
 
-It connects when it is asked for something, and sends a volume when it is first asked for it, and
-again to a server that has restarted or has forgotten it for others.
+It connects at the first request, and sends a volume when that is first projected, and
+again to a server that has restarted or has dropped it for others.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class ProjectorClient:
         """Compute line integrals; send the body again if the server has dropped it.
 
         Args:
-            name, body: what is projected; None if it is there already.
+            name, body: the body to project; None if it is there already.
             cone_vec: n views, object frame.
             shape: detector (rows, cols).
 

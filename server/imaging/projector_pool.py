@@ -1,10 +1,10 @@
 """One or several projector servers behind one twin: each request goes to one that is free.
 
-Each of several projectors holds at most `MAX_OPEN_REQUESTS`, so a fast one, which is free more
-often, gets more of them. One that is lost rests for `REST_S`, and its requests go to others, or to
-itself after that. One that is much slower than usual is not given up, but a second one is asked as
-well, and the first answer counts: all projectors of one kind give the same bytes. When the pool's
-patience ends, it raises `ProjectorUnavailable`.
+Each of several projectors holds at most `MAX_OPEN_REQUESTS`, so a fast one, which is free
+more often, gets more of them. One that is lost rests for `REST_S`, and its requests go to
+others, or to itself after that. One that is much slower than usual is not given up, but a
+second one is asked as well, and the first answer counts: all projectors of one kind give
+the same bytes. When the pool's patience ends, it raises `ProjectorUnavailable`.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class _Member:
         client: its client.
         open: requests under way.
         pace_s: for a view, lately; None before the first.
-        rests_until: when it may be asked again, on the loop's clock.
+        rests_until: end of its rest, on the loop's clock.
         kind: version and backend; None while unknown.
         views: made so far.
     """
@@ -98,8 +98,8 @@ class ProjectorPool:
         return max((room for room in found if room is not None), default=None)
 
     async def put(self, name: str, body: Body) -> None:
-        """Store a body, and send it to one projector, which shows that it fits; errors as
-        the client's."""
+        """Store a body, and send it to one projector, which shows that it fits;
+        errors as the client's."""
         self._values[name] = body
         await self._deal(name, None, (0, 0))
 
@@ -110,8 +110,8 @@ class ProjectorPool:
         await asyncio.gather(*removals, return_exceptions=True)
 
     async def project(self, name: str, cone_vec: ConeVec, shape: tuple[int, int]) -> Float32Array:
-        """Compute line integrals, float32 (n, rows, cols); errors as
-        `ProjectorClient.project`."""
+        """Compute line integrals, float32 (n, rows, cols);
+        errors as `ProjectorClient.project`."""
         images = await self._deal(name, cone_vec, shape)
         assert images is not None
         return images
@@ -172,7 +172,7 @@ class ProjectorPool:
                         if error.code == Code.INVALID_PARAMS or len(refused) == len(self):
                             raise
                     else:
-                        running.clear()  # who comes late keeps its place until it answers
+                        running.clear()  # late requests keep their place until they are answered
                         return images
                 if not running:
                     asked.clear()
@@ -181,8 +181,8 @@ class ProjectorPool:
                 task.cancel()
 
     def _free(self, asked: set[_Member], now: float) -> _Member | None:
-        """Choose the next projector: of the free ones that with least to do, then the
-        fastest."""
+        """Choose the next projector: of the free ones that with least to do,
+        then the fastest."""
         most = MAX_OPEN_REQUESTS if len(self) > 1 else math.inf
         free = (
             m for m in self._members if m not in asked and m.open < most and m.rests_until <= now
@@ -250,12 +250,12 @@ class ProjectorPool:
 
 
 async def _room_of(member: _Member) -> int | None:
-    """Return the memory that a projector can have for a sample [bytes]; None if it does
-    not answer."""
+    """Return the memory that a projector can have for a sample [bytes]; None if it
+    does not answer."""
     try:
         health = await asyncio.wait_for(member.client.health(), LATE_S)
     except (ProjectorUnavailable, RpcError, TimeoutError):
-        return None  # who is silent is asked when the scan runs
+        return None  # it may answer when the scan runs
     if health.memory_evictable is None:
         return None
     return health.memory_limit - health.memory_used + health.memory_evictable

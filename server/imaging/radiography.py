@@ -1,12 +1,13 @@
 """One image from poses to counts, by the physics that was chosen when the twin started.
 
-`ideal` is the plain model of `flexdt.twin.physics.exposure`: one attenuation for each material, no
-distance law. `poly` takes the path through each material, the tube's spectrum, the focal spot and
-the panel (see `flexdt.twin.physics`); `mono` is the same chain with photons of one energy.
+`ideal` is the plain model of `flexdt.twin.physics.exposure`: one attenuation for each
+material, no distance law. `poly` takes the path through each material, the tube's
+spectrum, the focal spot and the panel (see `flexdt.twin.physics`); `mono` is the same
+chain with photons of one energy.
 
-What is wrong with an image at first sight (too bright, too dark, cut off) is judged on the image
-without noise and as though X-rays were on, so that users are warned before a scan. How good the
-images of a scan will be is forecast in a worker process with limits.
+Saturated, starved and truncated images are judged on the image without noise and as
+though X-rays were on, so that users are warned before a scan. How good the images of a
+scan will be is forecast in a worker process with limits.
 """
 
 from __future__ import annotations
@@ -50,7 +51,8 @@ SCATTER: Final = mc.ScatterSettings()
 MAX_MEMORY_S: Final = 10.0
 """Time after which an earlier frame has no effect on the panel [s]."""
 Before = Sequence[tuple[Radiograph, float]]
-"""Earlier frames taken with X-rays on, and the time [s] from their ends to this frame's start."""
+"""Earlier frames taken with X-rays on, and the time [s] from their ends to
+this frame's start."""
 MAX_PROPOSALS: Final = 10
 """Number of proposed settings."""
 JUDGED_STEP_PX = 3
@@ -58,7 +60,7 @@ JUDGED_STEP_PX = 3
 CUT_OFF_INTEGRAL = 0.05
 """Line integral at an edge of the image above which the sample counts as cut off."""
 SATURATED, STARVED, CUT_OFF = 1, 2, 4
-"""What a pixel's mark is the sum of."""
+"""Terms of a pixel's mark."""
 
 
 def with_spectra(machine: Machine, physics: Physics) -> Machine:
@@ -91,7 +93,7 @@ class Radiography:
         model: of tube and detector, of the first.
         physics: ideal, mono or poly.
         panel, tube: of the other two.
-        scatter: what the sample scatters onto the panel, of the other two: off or mc.
+        scatter: the sample's scatter on the panel, of the other two: off or mc.
     """
 
     imaging: Imaging
@@ -281,8 +283,8 @@ class Radiography:
     def signal(
         self, radiograph: Radiograph, camera: CameraSettings, exposure: ExposureSettings
     ) -> Float32Array:
-        """Compute the expected counts above dark as if X-rays were on, not clipped,
-        (rows, cols)."""
+        """Compute the expected counts above dark as if X-rays were on, not
+        clipped, (rows, cols)."""
         if radiograph.expected is not None:
             return expected_counts(self.panel, camera, radiograph.expected.mean_e)
         lit = replace(exposure, xrays_on=True)
@@ -335,7 +337,7 @@ def marks_of(
 
     Args:
         radiography, radiograph, camera, exposure: as in `flags_of`.
-        binning: pixels a side; what holds for any of them holds for their mean.
+        binning: pixels a side; a mark of any of them is a mark of their mean.
     """
     lines = radiograph.shown
     signal = radiography.signal(radiograph, camera, exposure)
@@ -345,7 +347,8 @@ def marks_of(
     edge[1:-1, 1:-1] = False
     marks += np.where(edge & (lines > CUT_OFF_INTEGRAL), CUT_OFF, 0)
     rows, cols = (n // binning for n in lines.shape)
-    # Surplus rows and columns are cut off, as `binned_mean` does: their marks go to the last kept.
+    # Surplus rows and columns are cut off, as `binned_mean` does: their marks go to the
+    # last kept.
     small = marks[: rows * binning, : cols * binning].astype(np.uint8)
     height, width = small.shape
     small[-1] |= np.bitwise_or.reduce(marks[height - 1 :, :width]).astype(np.uint8)
@@ -373,7 +376,8 @@ def flags_of(
     lines = radiograph.shown
     signal = radiography.signal(radiograph, camera, exposure)[::JUDGED_STEP_PX, ::JUDGED_STEP_PX]
     top = radiography.saturating
-    # The signal of an open beam, as a logarithm. Two digits: with more, poly would tell distances.
+    # The signal of an open beam, as a logarithm. Two digits: with more, poly would reveal
+    # distances.
     beam = float(
         np.median(lines[::JUDGED_STEP_PX, ::JUDGED_STEP_PX] + np.log(np.maximum(signal, 1e-30)))
     )

@@ -30,8 +30,8 @@ class TokenCheck:
         self._wrong = 0
 
     async def check(self, given: str | None, client: str) -> None:
-        """Compare a token with the server's; delay the answer to each wrong one more than
-        the last.
+        """Compare a token with the server's; delay the answer to each wrong one
+        more than the last.
 
         The connection is closed after `MAX_WRONG_TOKENS` wrong ones.
 

@@ -1,7 +1,7 @@
 """Batches: each item in its lane, the answers together in the order of the items.
 
-An answer is encoded when it is made. Where all together become too large, the others are refused
-without being made.
+An answer is encoded when it is made. Where all together become too large, the others are
+refused without being made.
 """
 
 from __future__ import annotations

@@ -13,8 +13,8 @@ _Lane = OrderedDict[object, deque[asyncio.Future[None]]]
 class LoopTurns:
     """One turn is given in each turn of the loop; within a lane, connections alternate.
 
-    Between two requests the loop polls its sockets, so an E-stop is received after at most one
-    request of another connection, however many are queued.
+    Between two requests the loop polls its sockets, so an E-stop is received after at
+    most one request of another connection, however many are queued.
     """
 
     def __init__(self) -> None:
@@ -22,7 +22,7 @@ class LoopTurns:
         self._due = False
 
     async def take(self, who: object, lane: int) -> None:
-        """Wait for a turn of the connection `who` in a lane; lower lanes go first."""
+        """Wait for a turn of a connection in a lane; lower lanes go first."""
         loop = asyncio.get_running_loop()
         turn = loop.create_future()
         self._lanes[lane].setdefault(who, deque()).append(turn)
@@ -32,8 +32,8 @@ class LoopTurns:
         await turn
 
     def _give(self) -> None:
-        """Give the first waiting connection of the lowest lane its turn, and schedule the
-        next."""
+        """Give the first waiting connection of the lowest lane its turn, and
+        schedule the next."""
         self._due = False
         for lane in self._lanes:
             while lane:

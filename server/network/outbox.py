@@ -1,8 +1,8 @@
 """The send queue of a connection.
 
-Messages go straight to the transport while the client keeps up. Otherwise state-like events keep
-the newest value per slot and ordered ones a bounded queue. Sending never blocks; a caller that has
-to wait for a slow client awaits `room`.
+Messages go straight to the transport while the client keeps up. Otherwise state-like
+events keep the newest value per slot and ordered ones a bounded queue. Sending never
+blocks; a caller that has to wait for a slow client awaits `room`.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from flexdt.protocol.rpc_errors import internal
 from flexdt.runtime.access import ConnectionLimits
 
 WRITE_BYTES = 1 << 18
-"""Largest number of bytes given to the transport at a time; it copies what it cannot send
-at once."""
+"""Largest number of bytes given to the transport at a time; it copies the bytes that it
+cannot send at once."""
 
 
 class SendTarget(Protocol):
@@ -43,7 +43,8 @@ class SendTarget(Protocol):
 
 
 class Outbox:
-    """The send queue: replies and ordered events in order, then the newest value of each slot."""
+    """The send queue: replies and ordered events in order, then the newest
+    value of each slot."""
 
     def __init__(self, link: SendTarget) -> None:
         self.link = link

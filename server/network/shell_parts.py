@@ -1,7 +1,8 @@
-"""The interface of the TCP shells of twin and projector to an application, and to other processes.
+"""The interface of the TCP shells of twin and projector to an application, and
+to other processes.
 
-The shells differ in how they read and write: lines or frames in order for the twin, frames side by
-side and without copies for the projector.
+The shells differ in how they read and write: lines or frames in order for the twin,
+frames side by side and without copies for the projector.
 """
 
 from __future__ import annotations

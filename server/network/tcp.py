@@ -1,17 +1,19 @@
 """The asyncio shell: sockets around `protocol.Connection`, an application behind it.
 
-Requests of one connection are handled in order, one at a time, so that `axes.move` with wait and
-then `projection.get` do what they say; urgent ones (stop, E-stop, abort, ping) overtake. What has
-been read waits as bytes and is decoded when its turn comes: one request of one connection in each
-turn of the loop (`turns`). Bytes that name an urgent method are looked at as they arrive. A client
-that does not read costs only its own connection: state events keep the newest value per slot,
-ordered events have a bounded queue, and what stays stuck is cut off. This module knows nothing of
-what methods mean, except that `session.hello` brings the token and that an E-stop comes first.
+Requests of one connection are handled in order, one at a time, so that `axes.move` with
+wait and then `projection.get` show the end of the motion; urgent ones (stop, E-stop,
+abort, ping) overtake. Received messages wait as bytes and are decoded when their turn
+comes: one request of one connection in each turn of the loop (`turns`). Bytes that name
+an urgent method are looked at as they arrive. A client that does not read costs only its
+own connection: state events keep the newest value per slot, ordered events have a bounded
+queue, and a client that stays stuck is disconnected. This module does not know the
+meaning of methods, except that `session.hello` brings the token and that an E-stop comes
+first.
 
-A client takes one of `max_clients` places when it has shown the token, or with its first request
-where there is none. Until then, and while all places are taken, it is in a `Room`: there it is
-answered to hello, and to what is urgent once it has shown the token where there is one, but to
-nothing else.
+A client takes one of `max_clients` places when it has shown the token, or with its first
+request where there is none. Until then, and while all places are taken, it is in a
+`Room`: there it may call hello, and urgent methods once it has shown the token where
+there is one, but nothing else.
 """
 
 from __future__ import annotations
@@ -43,8 +45,8 @@ from flexdt.server.network import shell_parts as parts
 READ_AHEAD_BYTES = 512 << 10
 """Bytes of complete messages that may wait for one connection; then reading pauses."""
 BUFFER_BYTES: Final = 1 << 15
-"""Bytes taken from one connection before others have their turn: 8 192 empty frames, a
-few ms."""
+"""Bytes taken from one connection before others have their turn: 8 192 empty
+frames, a few ms."""
 MAX_INLINE_BYTES = 32 << 10
 """Bytes of a message above which it is read in another process."""
 ESTOP = "safety.estop"
@@ -53,8 +55,8 @@ ESTOP_BYTES = ESTOP.encode()
 Given = Mapping[str, object] | list[object] | Params | RpcError | None
 """Parameters as they came, or as they were validated apart."""
 MAX_URGENT_IN_SERVICE = 8
-"""Largest number of urgent requests of one connection in service; E-stops four times as
-many."""
+"""Largest number of urgent requests of one connection in service; E-stops four
+times as many."""
 LOOK_S = 0.001
 """Time for which one turn of the loop searches for urgent requests other than E-stops [s]."""
 RESERVED_PLACES = 16
@@ -91,8 +93,8 @@ class TcpServer(ListeningServer):
         return _Link(self)
 
     def look_soon(self, link: _Link) -> None:
-        """Schedule a search for urgent requests of a connection, in turns that no flood
-        can fill."""
+        """Schedule a search for urgent requests of a connection, in turns that no
+        flood can fill."""
         self._to_look_at[link] = None
         if not self._look_due:
             self._look_due = True
@@ -144,7 +146,7 @@ async def serve(
         token: that clients must bring.
         ssl: for TLS.
         methods: there are.
-        observe: told of every answer.
+        observe: called for every answer.
         read: reads large messages; None: they are read in the loop, which then waits for
             it.
 
@@ -177,7 +179,7 @@ class _Link(asyncio.BufferedProtocol):
         self.session: parts.Session | None = None
         self.let_in = server.token is None
         self.arrived = asyncio.Event()
-        self.estop_came = False  # and stands, maybe, among what has not been looked at
+        self.estop_came = False  # and is, maybe, among the messages that have not been examined
         self.ended = False
         self.broken = 0
         self.token_check = admission.TokenCheck(
@@ -187,7 +189,8 @@ class _Link(asyncio.BufferedProtocol):
         self.allowance_at = 0.0
         self.out = outbox.Outbox(self)
         self.split: dict[int, batches.Split] = {}
-        """Batches whose urgent items have been begun; the others wait in the queue, by identity."""
+        """Batches whose urgent items have been begun; the others wait in the
+        queue, by identity."""
         self.worker: asyncio.Task[None] | None = None
         self.tasks: set[asyncio.Task[None]] = set()
         self.deadlines = deadlines.Deadlines(
@@ -197,8 +200,8 @@ class _Link(asyncio.BufferedProtocol):
     # -- the transport's calls ---------------------------------------------------------------
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Set up a new connection, which waits for a place; open its session without a
-        token."""
+        """Set up a new connection, which waits for a place; open its session
+        without a token."""
         self.transport = cast(asyncio.Transport, transport)
         self.loop = asyncio.get_running_loop()
         self.server.opened += 1
@@ -217,8 +220,8 @@ class _Link(asyncio.BufferedProtocol):
         self.worker.add_done_callback(self._crashed)
 
     def _seat(self) -> bool:
-        """Give the connection a place, or a reserved one; return whether it has one of
-        its own."""
+        """Give the connection a place, or a reserved one; return whether it has one
+        of its own."""
         server = self.server
         if self in server.links:
             return True
@@ -264,7 +267,8 @@ class _Link(asyncio.BufferedProtocol):
             self.deadlines.stop("message")  # the rest comes when we read again
 
     def overtake(self) -> None:
-        """Start the urgent requests of what has arrived, wherever in the queue they are."""
+        """Start the urgent requests among the received messages, wherever in the
+        queue they are."""
         if self.gone.is_set() or not self.let_in:
             return
         found: list[Coroutine[object, object, None]] = []
@@ -283,7 +287,7 @@ class _Link(asyncio.BufferedProtocol):
             if isinstance(message, m.Batch) and not all(map(self._urgent, message.items)):
                 split = self.split[id(raw)] = batches.Split(raw, self._batch(message.items))
                 found.append(self._begin(split))
-                return False  # its other items wait where they stand
+                return False  # its other items stay in the queue
             found.append(self._serve(message, urgent=True))
             return True
 
@@ -355,7 +359,7 @@ class _Link(asyncio.BufferedProtocol):
         self.transport.abort()
 
     def displace(self) -> None:
-        """End the connection for a newer one; a client is told why, a stranger is not."""
+        """End the connection for a newer one; a client gets the reason, a stranger does not."""
         if self.let_in:
             self.out.reply(m.Failure(None, self._no_place()))
         if self.let_in and not self.transport.get_write_buffer_size():
@@ -380,7 +384,7 @@ class _Link(asyncio.BufferedProtocol):
     def _open(self) -> None:
         """Admit the connection and open the application's session."""
         self.let_in = True
-        self.loop.call_soon(self.overtake)  # what came before was not looked at
+        self.loop.call_soon(self.overtake)  # earlier messages were not examined
         self.deadlines.stop("hello")
         self._relax()
         try:
@@ -411,8 +415,8 @@ class _Link(asyncio.BufferedProtocol):
         return self._lane(message) != loop_turns.ORDINARY
 
     async def _work(self) -> None:
-        """Serve the connection's messages in order, one in each turn, until its stream
-        has ended."""
+        """Serve the connection's messages in order, one in each turn, until its
+        stream has ended."""
         while True:
             while self.wire.whole:
                 await self.server.turns.take(
@@ -591,7 +595,7 @@ class _Link(asyncio.BufferedProtocol):
             return m.Failure(id, error)
         except Exception:
             self.log("handler failed", logging.ERROR, error=True, method=name[:100])
-            # The id is what a person needs to find the traceback.
+            # A person needs the id to find the traceback.
             return m.Failure(id, errors.internal(trace))
 
     async def _check_token(self, hello: Hello) -> None:
@@ -629,7 +633,7 @@ class _Link(asyncio.BufferedProtocol):
         return self._load >= self.limits.max_waiting or ahead > most
 
     def _relax(self) -> None:
-        """Resume reading once enough of what was read has been served."""
+        """Resume reading once enough messages have been served."""
         ahead = self.wire.pending if self.wire.whole else 0
         if self._load <= self.limits.max_waiting // 2 and ahead <= READ_AHEAD_BYTES // 2:
             self.transport.resume_reading()

@@ -1,13 +1,14 @@
 """The one thread that computes, and the work of a request, which it does block by block.
 
-Numba's kernels use all cores by themselves and release the interpreter, so one thread is enough
-and the event loop stays responsive. A job's blocks go to the loop as they are made.
+Numba's kernels use all cores by themselves and release the interpreter, so one thread is
+enough and the event loop stays responsive. A job's blocks go to the loop as they are
+made.
 
-Steps are computed in the order in which they come, and a lane has one of them in the queue at a
-time, so lanes take turns and a long scan never starves a single view. A lane is one client's batch
-work or one client's interactive work. A block is asked for when the one before it has been sent,
-and at most `MAX_IN_HAND` requests of a lane have results on their way: of a client that does not
-read no more than these is computed.
+Steps are computed in the order in which they come, and a lane has one of them in the
+queue at a time, so lanes take turns and a long scan never starves a single view. A lane
+is one client's batch work or one client's interactive work. A block is requested when the
+one before it has been sent, and at most `MAX_IN_HAND` requests of a lane have results on
+their way: of a client that does not read no more than these is computed.
 
 `begin` sets the number of threads and compiles before the first request.
 """
@@ -45,11 +46,12 @@ MAX_IN_HAND: Final = 3
 """Largest number of requests of a lane that are computed or sent."""
 
 Step = Callable[[], object]
-"""A piece of work; its value goes to whoever waits for it."""
+"""A piece of work; its value goes to the waiting request."""
 
 
 class Lane(asyncio.Lock):
-    """One client's batch work, or its interactive work; held by the step that is in the queue."""
+    """One client's batch work, or its interactive work; held by the step that
+    is in the queue."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -80,7 +82,7 @@ class ComputeJob:
         return self._turn is not None and not (running or self._turn.done())
 
     def end(self, error: Exception) -> None:
-        """Cancel the job: whoever waits for a step gets `error`, and further steps raise it."""
+        """Cancel the job: a waiting request gets `error`, and further steps raise it."""
         self.error = self.error or error
         if self._turn is not None:
             self._turn.cancel()
@@ -110,7 +112,8 @@ class ComputeJob:
             return await asyncio.wrap_future(self._step)
 
     def sent(self) -> None:
-        """Release the lane for another request: the answer was sent, or nobody waits for it."""
+        """Release the lane for another request: the answer was sent, or its
+        request was abandoned."""
         if self._in_hand:
             self._in_hand = False
             self.lane.in_hand.release()
@@ -170,8 +173,8 @@ def views_a_block(shape: tuple[int, int]) -> int:
 
 
 def begin(threads: int) -> None:
-    """Set the thread count of this thread's kernels, and load or compile the projection
-    kernels.
+    """Set the thread count of this thread's kernels, and load or compile
+    the projection kernels.
 
     Those of back projection, which few clients need, are compiled later in a thread of
     low priority.
@@ -180,7 +183,7 @@ def begin(threads: int) -> None:
         ValueError: more threads than numba was started with.
     """
     numba.set_num_threads(threads)
-    LOG.setLevel(logging.ERROR)  # the supervisor says what is waited for
+    LOG.setLevel(logging.ERROR)  # the supervisor reports the wait
     warm_up_forward()
     threading.Thread(target=_compile_back, name="projector-compiling", daemon=True).start()
 

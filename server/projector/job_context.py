@@ -1,4 +1,4 @@
-"""What the projector's methods work with: the compute thread, the volumes and the clients.
+"""State of the projector for its methods: the compute thread, the volumes and the clients.
 
 Jobs are started and results are sent from here, in one piece or in parts.
 """
@@ -127,8 +127,8 @@ class Context:
     async def send_parts(
         self, client: JobClient, id: Id, array: npt.NDArray[np.generic], start: int
     ) -> int:
-        """Send an array as parts of a result, from its element `start` on; return their
-        number."""
+        """Send an array as parts of a result, from its element `start` on;
+        return their number."""
         flat = np.ascontiguousarray(array).reshape(-1)
         step = PART_BYTES // flat.itemsize
         parts = 0

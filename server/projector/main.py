@@ -1,7 +1,8 @@
 """`python -m flexdt.server.projector.main`: the projector server as a process.
 
-Compiles its kernels, then prints one JSON `ready` line on standard output. SIGTERM and SIGINT end
-it cleanly. Only this module chooses the implementation and touches the process.
+Compiles its kernels, then prints one JSON `ready` line on standard output. SIGTERM and
+SIGINT end it cleanly. Only this module chooses the implementation and touches the
+process.
 """
 
 from __future__ import annotations

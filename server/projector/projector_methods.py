@@ -1,7 +1,7 @@
 """The methods of the projector server.
 
-Each method translates parameters, has the work done in the compute thread, and translates back. The
-connections are in `service`.
+Each method translates parameters, has the work done in the compute thread, and translates
+back. The connections are in `service`.
 """
 
 from __future__ import annotations
@@ -96,8 +96,8 @@ async def volume_remove(context: Context, client: JobClient, id: Id, p: wire.Vol
 
 
 async def project(context: Context, client: JobClient, id: Id, p: wire.Project) -> object:
-    """Compute line integrals, block of views by block; replace a waiting request of the
-    same key."""
+    """Compute line integrals, block of views by block; replace a waiting request of
+    the same key."""
     volume = context.store.get(p.volume)
     view = math.prod(p.detector)
     if 4 * view > MAX_VIEW_BYTES:

@@ -1,14 +1,14 @@
 """The projector server: connections come and go, requests are answered side by side.
 
-Work is computed in turns (see `compute`) and results are sent as they are made. The methods are in
-`projector_methods`.
+Work is computed in turns (see `compute`) and results are sent as they are made. The
+methods are in `projector_methods`.
 
-A client takes one of `max_clients` places when it has shown the token, or with its first request
-where there is none. Until then it waits in a `Room`; without the token, small messages are taken
-from it, one at a time and few in all.
+A client takes one of `max_clients` places when it has shown the token, or with its first
+request where there is none. Until then it waits in a `Room`; without the token, small
+messages are taken from it, one at a time and few in all.
 
-On its health and metrics pages volumes are counted but not named, since names may reveal a user's
-samples.
+On its health and metrics pages volumes are counted but not named, since names may reveal
+a user's samples.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class ProjectorServer(ListeningServer):
             task.cancel()
 
     def _seat(self, client: JobClient) -> None:
-        """Give a client a place; one that has been admitted may send whole frames.
+        """Give a client a place; one that has been admitted may send full frames.
 
         Raises:
             RpcError: -32003, all places are taken.
@@ -124,8 +124,8 @@ class ProjectorServer(ListeningServer):
         link.dismiss(m.Failure(None, error))
 
     def frame(self, link: FrameLink, body: memoryview) -> None:
-        """Serve a client's frame in a task; refuse it from one with too many, or without
-        a token."""
+        """Serve a client's frame in a task; refuse it from one with too many, or
+        without a token."""
         client = self.context.clients[link]
         if len(client.tasks) >= self.limits.max_waiting:
             self.refuse(link, errors.busy("too many requests under way"))
@@ -242,7 +242,7 @@ async def serve_projector(
         host, port: where; others than loopback need a token.
         memory_limit: bytes that all volumes together may take.
         begin: run first in the compute thread: threads, warm-up.
-        bound: told the port as soon as it is taken.
+        bound: called with the port as soon as it is taken.
         facts: backend and threads, for `health`.
         limits: of connections.
         token: clients must bring it.

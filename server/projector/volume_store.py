@@ -1,8 +1,9 @@
 """Volumes, meshes and scenes of the projector by name.
 
-Memory is counted as what a volume takes once it is projected: its voxels and the projector's own
-z-contiguous copy. Where it is needed, volumes that were put as evictable are forgotten, the least
-recently used first; the others stay until they are removed. What does not fit then is an error.
+The counted memory is that of a projected volume: its voxels and the projector's own
+z-contiguous copy. Where it is needed, volumes that were put as evictable are forgotten,
+the least recently used first; the others stay until they are removed. A volume that does
+not fit then is an error.
 """
 
 from __future__ import annotations
@@ -131,8 +132,8 @@ class VolumeStore:
         Chunks come in order. The complete volume is not stored: `put` does that.
 
         Returns:
-            Bytes received so far and, once all have come, what makes the volume or mesh
-            of them.
+            Bytes received so far and, once all have come, the function that makes the
+            volume or mesh.
 
         Raises:
             RpcError: -32008 above the memory limit; -32602, chunks that do not fit
@@ -142,7 +143,7 @@ class VolumeStore:
         key = (owner, name)
         if start == 0:
             self._uploads.pop(key, None)
-            # The namesake stays in use until the new volume is whole, so both are counted.
+            # The namesake stays in use until the new volume is complete, so both are counted.
             self.reserve(f"volume {name!r}", _needed(what))
             self._uploads[key] = _Upload(owner, what, np.empty(total, np.uint8))
         upload = self._uploads.get(key)

@@ -1,12 +1,13 @@
 """Length-prefixed frames over an asyncio transport without needless copies, for both ends.
 
-Received frames land in memory of their own, so arrays made of them stay valid; large payloads go
-out slice by slice, so the transport never buffers more than a slice.
+Received frames land in memory of their own, so arrays made of them stay valid; large
+payloads go out slice by slice, so the transport never buffers more than a slice.
 
-`ProjectorLink` is a client's end of one connection. Several requests may be open at once; results
-that come in parts are put together. When the connection ends, every open request fails with
-`LinkLost` and the link cannot be used again: `ProjectorClient` makes a new one. A server that is
-silent while something is asked of it, also for its health, counts as gone.
+`ProjectorLink` is a client's end of one connection. Several requests may be open at once;
+results that come in parts are put together. When the connection ends, every open request
+fails with `LinkLost` and the link cannot be used again: `ProjectorClient` makes a new
+one. A server that is silent while a request is open, also a health request, counts as
+lost.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from flexdt.server.network.deadlines import Deadlines
 SILENT_S: Final = 10.0
 """Silence after which a projector that owes an answer counts as lost [s]."""
 ASK_AGAIN_S: Final = 3.0
-"""Time after which it is asked for its health, which it answers also while it computes [s]."""
+"""Time after which its health is requested, which it answers also while it computes [s]."""
 SLICE_BYTES: Final = 1 << 18
 """Largest number of bytes given to the transport at a time."""
 MAX_LAST_WORD_S: Final = 1.0
@@ -50,10 +51,10 @@ class FrameLink(asyncio.BufferedProtocol):
 
     Attributes:
         on_frame: called with each frame's body.
-        on_broken: called when the peer announces a frame that is too large, or ends the stream
-            inside one; then it is over.
+        on_broken: called when the peer announces a frame that is too large, or ends the
+            stream inside one; then it is over.
         on_lost: called once when the connection has ended.
-        on_made: called when the connection stands.
+        on_made: called when the connection is made.
         max_frame: largest frame received [bytes].
         send_timeout_s: a peer that takes nothing for so long is cut off; None: never.
         frame_timeout_s: a frame begun must be complete after this; None: never.
@@ -119,8 +120,8 @@ class FrameLink(asyncio.BufferedProtocol):
             self.on_frame(self, body)
 
     def _begin(self, size: int) -> None:
-        """Reserve memory for a frame of `size` bytes; call `on_broken` for one that is
-        too large."""
+        """Reserve memory for a frame of `size` bytes; call `on_broken` for one that
+        is too large."""
         self._filled = 0
         if size > self.max_frame:
             self._over = True

@@ -1,9 +1,9 @@
 """Corrections: dated, named and never edited, each a JSON file under DATA/corrections.
 
-The one in force is part of the state: its name, None for nominal. Those before it, for `revert`,
-are the names in DATA/corrections/history, in the order in which they were put in force; where the
-two disagree (a kill between their writing), the state is right. A damaged file is set aside; if it
-was in force, no correction is.
+The one in force is part of the state: its name, None for nominal. Those before it, for
+`revert`, are the names in DATA/corrections/history, in the order in which they were put
+in force; where the two disagree (a kill between their writing), the state is right. A
+damaged file is set aside; if it was in force, no correction is.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ class Corrections:
 
     Args:
         folder: where they are kept; made when the first is stored.
-        in_force: the name in force by the state, None for nominal; earlier servers had the whole
-            history there.
+        in_force: the name in force by the state, None for nominal; earlier servers had
+            the complete history there.
         most: corrections there may be.
     """
 
@@ -181,8 +181,8 @@ class Corrections:
         return history[-1:] if self.filed else history
 
     def store_history(self, changes: own.Changes, history: History) -> None:
-        """Write the history; on a full disk it stays as it was, which costs steps of
-        `revert` only.
+        """Write the history; on a full disk it stays as it was, which costs steps
+        of `revert` only.
 
         Raises:
             DatasetWriteError: the system cannot write.

@@ -1,7 +1,7 @@
 """Geometry from data sets of the data directory: `calibration.fit` and `calibration.align`.
 
-The work is that of `flexdt.calibrate` and `flexdt.align`, in a worker process with limits on time
-and memory; one runs at a time, and it ends when nobody waits for it any more.
+The work is that of `flexdt.calibrate` and `flexdt.align`, in a worker process with limits
+on time and memory; one runs at a time, and it ends when its client has gone.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def fit(root: Directory, asked: p.CalibrationFit, *_: object) -> p.CalibrationFi
     if not is_shipped(phantom) and Path(phantom).suffix in PHANTOM_SUFFIXES:
         phantom = load_phantom_file(_text(root, phantom), phantom)
     elif phantom != UNKNOWN and not is_shipped(phantom):
-        load_phantom(phantom)  # says which there are
+        load_phantom(phantom)  # the error lists the names
     marks = None
     if asked.markers is not None:
         marks = [(m.frame, m.marker, m.column, m.row, m.sigma) for m in asked.markers]

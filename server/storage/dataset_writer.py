@@ -1,9 +1,10 @@
 """Writes one data set: images, the scanner's texts, the script, flexdt.json.
 
-Each file appears when whole. Until `finish` the data set is marked incomplete, so a killed server
-leaves a folder that states its condition. Existing images are recognised, so a scan can be resumed.
-`put` may be called from several threads. A name with folders, an image of another shape or type
-than the scan's, and finishing while an image is missing are errors.
+Each file appears only when complete. Until `finish` the data set is marked incomplete, so
+a killed server leaves a folder that states its condition. Existing images are recognised,
+so a scan can be resumed. `put` may be called from several threads. A name with folders,
+an image of another shape or type than the scan's, and finishing while an image is missing
+are errors.
 """
 
 from __future__ import annotations
@@ -36,12 +37,14 @@ class DatasetWriter:
         root: the data directory; nothing outside it is ever written.
         record: the scan about to run; its name names the folder.
         script: the script byte for byte, or None.
-        resume: go on with a folder that holds the same scan; without it such a folder is an error.
+        resume: go on with a folder that holds the same scan; without it such a folder is
+            an error.
         sync, write: see `Directory`.
 
     Raises:
         DatasetNameError: the record's name or a file's is not plain.
-        DatasetExistsError: the folder holds a data set already, or another one than to be resumed.
+        DatasetExistsError: the folder holds a data set already, or another one than to be
+            resumed.
         DiskFullError: the missing images would not fit.
         DatasetWriteError: the folder cannot be written.
     """
@@ -157,8 +160,8 @@ class DatasetWriter:
         return {name for name in found if self._whole(name)}
 
     def _whole(self, name: str) -> bool:
-        """Return whether the file holds an image of the right format (only its header is
-        read)."""
+        """Return whether the file holds an image of the right format (only its
+        header is read)."""
         try:
             with self._files.open(name) as file, tifffile.TiffFile(file) as tiff:
                 page = tiff.pages[0]

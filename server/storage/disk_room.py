@@ -1,8 +1,8 @@
-"""Room on the disk for what comes in large: scans and uploads leave some for all that is small.
+"""Room on the disk for large data: scans and uploads leave some for all that is small.
 
-State, jobs and corrections are small and must be written. What is large is refused before it takes
-the last room, so that only other programs can fill the disk; then what must be written goes into
-spare files (`runtime/files/spare_files.py`).
+State, jobs and corrections are small and must be written. Large data are rejected before
+they take the last room, so that only other programs can fill the disk; then state and
+jobs are written into spare files (`runtime/files/spare_files.py`).
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class UsedBytes:
     def _count(self, folder: Directory, name: str, changed_ns: int, there: dict[str, _Seen]) -> int:
         """Sum up a folder, reusing what is known of unchanged ones; record them in `there`."""
         seen = self._seen.get(name)
-        # A change within the clock's grain does not show: what is young is read again.
+        # A change within the clock's grain does not show: a young folder is read again.
         old = time.time_ns() - changed_ns > MIN_SETTLED_NS
         if seen is None or seen.changed_ns != changed_ns or not old:
             seen = _read(folder, changed_ns)
@@ -95,7 +95,7 @@ class DiskRoom:
 
     Attributes:
         root: the data directory.
-        quota: bytes that it may hold; None for what the disk holds.
+        quota: bytes that it may hold; None: no limit but the disk's.
     """
 
     root: Directory
@@ -115,7 +115,7 @@ class DiskRoom:
             there: of these, bytes that are there already.
 
         Raises:
-            DiskFullError: says what is needed and what is free.
+            DiskFullError: with the needed and the free room.
         """
         need = size + RESERVE_BYTES - there
         free = free_bytes(self.root.path)

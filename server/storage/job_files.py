@@ -1,7 +1,8 @@
 """Jobs as they were, one small file each under DATA/jobs/status.
 
-A change of a job writes that job's file alone, so it costs the same however many jobs there are.
-What a scan starts from is in DATA/jobs, one file a data set (`server/scans/scan_record.py`).
+A change of a job writes that job's file alone, so it costs the same however many jobs
+there are. The start of a scan is in DATA/jobs, one file a data set
+(`server/scans/scan_record.py`).
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 from flexdt.twin.dataset.file_names import plain_name
 
 RECORDS = "jobs"
-"""Name of the folder of what scans start from."""
+"""Name of the folder of the records from which scans start."""
 FOLDER = "status"
 """Name of the folder of these files in it."""
 NUMBERED = re.compile(r"job-(\d{1,15})")
@@ -120,8 +121,8 @@ class JobFiles:
                 self._folder.discard(file)
 
     def settle(self) -> None:
-        """Clean the folders at the start: delete what killed writers left; set aside what
-        is no folder."""
+        """Clean the folders at the start: delete the rest of killed writers; set aside
+        other entries in place of folders."""
         own.settle(self._records, [FOLDER])
 
 

@@ -1,14 +1,15 @@
 """The state that a twin server restores after it was killed: DATA/state.json.
 
-Positions, settings, tube, camera, sample, an E-stop in force and the corrections in force are one
-document, so that a change of several of them is written whole or not at all. It does not grow with
-what was ever made: jobs have files of their own (`job_files`), of which those that have changed are
-written. A client's change that must survive is written first and takes effect afterwards (see
-`StateStore.keep`): if it cannot be written, nothing has changed. Positions and the progress of a
-scan are written as they change, at most a few times a second, and when the server stops. An E-stop
-waits for no disk, but it is written at once, whatever was written a moment ago or failed. After a
-restart X-rays are off, motors are where they were last recorded, and interrupted scans are marked
-so and can be resumed. A damaged document is set aside, and the server starts without it.
+Positions, settings, tube, camera, sample, an E-stop in force and the corrections in force
+are one document, so that a change of several of them is atomic. Its size does not depend
+on the number of jobs: jobs have files of their own (`job_files`), of which those that
+have changed are written. A client's change that must survive is written first and takes
+effect afterwards (see `StateStore.keep`): if it cannot be written, nothing has changed.
+Positions and the progress of a scan are written as they change, at most a few times a
+second, and when the server stops. An E-stop waits for no disk, but it is written at once,
+whatever was written a moment ago or failed. After a restart X-rays are off, motors are
+where they were last recorded, and interrupted scans are marked so and can be resumed. A
+damaged document is set aside, and the server starts without it.
 """
 
 from __future__ import annotations
@@ -63,7 +64,8 @@ class Memory(_Part):
     Attributes:
         jobs: as earlier servers kept them; those that have no file yet.
         jobs_made: jobs there ever were.
-        corrections: the name in force, None for nominal; several where their history has no file.
+        corrections: the name in force, None for nominal; several where their history has
+            no file.
     """
 
     schema_version: Literal[1] = Field(alias="schema")
@@ -149,7 +151,7 @@ def restore(memory: Memory, scanner: ScannerTwin, now: float) -> Sample | None:
     known: p.Scene | None
     known = memory.scene
     spec = scanner.machine.tube
-    # Which correction is in force the history says.
+    # The correction in force comes from the history.
     known = known.model_copy(update={"correction": None})
     if not spec.min_kV <= known.tube.kV <= spec.max_kV:  # the physics may be another one
         log(
@@ -171,7 +173,7 @@ def restore(memory: Memory, scanner: ScannerTwin, now: float) -> Sample | None:
             reason=str(error),
         )
         known = None
-    if memory.estop:  # stays in force, whatever else is begun anew
+    if memory.estop:  # stays in force in any case
         scanner.estop(now)
     return None if known is None else sample_of(known)
 
@@ -185,7 +187,7 @@ class StateStore:
 
     Args:
         root: the data directory.
-        make: makes the document; its argument says whether the server ends.
+        make: makes the document; its argument is true when the server ends.
         job_files: writes jobs.
         changed_jobs: returns the jobs that have changed since its last call, None for one
             that is forgotten.
@@ -267,11 +269,11 @@ class StateStore:
         """Write a change that must survive, then apply it.
 
         Args:
-            take: makes the change, once it is on the disk; if it raises, what was written
-                is as it was before.
-            after: the document with the change, from the one without; what it raises
-                leaves everything as it is. None where the document has nothing of it.
-            files: writes what the change needs besides, before the document.
+            take: makes the change, once it is on the disk; if it raises, the written
+                files are restored.
+            after: the document with the change, from the one without; an exception leaves
+                everything unchanged. None where the document has nothing of it.
+            files: writes the other files of the change, before the document.
 
         Raises:
             DatasetWriteError: the system cannot write; nothing has changed, here or on

@@ -14,9 +14,9 @@ from flexdt.runtime.workers import Worker
 
 # Parsing of uploaded meshes and scenes in a process of their own (`worker`).
 #
-# A parser that loops, exhausts its memory or crashes does not affect the server, and the event loop
-# never waits for the parser's interpreter lock. Each upload has a fresh process that may write no
-# file, and its result is validated like any other document.
+# A parser that loops, exhausts its memory or crashes does not affect the server, and the
+# event loop never waits for the parser's interpreter lock. Each upload has a fresh
+# process that may write no file, and its result is validated like any other document.
 
 TIMEOUT_S = 180.0
 MEMORY_BYTES = 3 << 30

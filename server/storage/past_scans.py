@@ -1,8 +1,8 @@
-"""Data sets of the data directory for clients: listed, told over time, their images.
+"""Data sets of the data directory for clients: listed, described over time, their images.
 
-Everything is read in worker processes with limits on time and memory, so that no folder, however
-large, damaged or slow, holds the loop or ends the server. Links are not followed. What was read is
-kept until its folder changes.
+Everything is read in worker processes with limits on time and memory, so that no folder,
+however large, damaged or slow, holds the loop or ends the server. Links are not followed.
+Results are kept until their folder changes.
 """
 
 from __future__ import annotations
@@ -144,10 +144,11 @@ class _LruCache:
 
 
 _INFOS, _THUMBNAILS = _LruCache(MAX_SETS), _LruCache(1000)
-"""Unlike those of `lru_cache`, they tell what is known: a list has `LIST_S` to read the rest."""
+"""Unlike those of `lru_cache`, they can be searched: a list has `LIST_S` to read the rest."""
 
 
-# A data set's folder ------------------------------------------------------------------------------
+# A data set's folder
+# ------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -171,8 +172,7 @@ _Images = tuple[FrameEntry | _UndocumentedFrame, ...]
 
 @dataclass(frozen=True, eq=False)
 class _Scan:
-    """A data set's folder as it was read; the last few are cached, with what is computed
-    from them.
+    """A data set's folder as it was read; the last few are cached, with derived values.
 
     Attributes:
         folder: its files.
@@ -325,7 +325,8 @@ def _info(path: Path, modified: float, scan: _Scan) -> p.DatasetInfo:
     )
 
 
-# dataset.list -------------------------------------------------------------------------------------
+# dataset.list
+# -------------------------------------------------------------------------------------
 
 
 def _list(
@@ -432,13 +433,14 @@ def _with_thumbnail(root: Directory, info: p.DatasetInfo, side: int, until: floa
     return info.model_copy(update={"thumbnail": made or None})
 
 
-# dataset.get --------------------------------------------------------------------------------------
+# dataset.get
+# --------------------------------------------------------------------------------------
 
 
 def _get(
     root: Directory, asked: p.DatasetGet, around: TwinContext, codec: Codec
 ) -> p.DatasetResult:
-    """Answer dataset.get: settings, poses over time, and what else is requested."""
+    """Answer dataset.get: settings, poses over time, and the other requested parts."""
     scan = _opened(root, asked.name)
     folder = scan.folder
     images = scan.images
@@ -516,7 +518,7 @@ def _mean(path: Path, key: tuple[object, ...]) -> float:
 
 @lru_cache(4)
 def _clearances(scan: _Scan, at: tuple[int, ...]) -> tuple[list[float | None], str]:
-    """Compute the smallest clearance of images [mm], and describe what was in the scene."""
+    """Compute the smallest clearance of images [mm], and describe the scene."""
     from flexdt.twin.collision.collision_scene import build_scene
     from flexdt.twin.collision.convex_solids import UprightCylinder
     from flexdt.twin.collision.first_contact import clearance
@@ -538,7 +540,8 @@ def _clearances(scan: _Scan, at: tuple[int, ...]) -> tuple[list[float | None], s
     return [mm if math.isfinite(mm) else None for mm in found], what
 
 
-# dataset.frame ------------------------------------------------------------------------------------
+# dataset.frame
+# ------------------------------------------------------------------------------------
 
 
 def _frame(

@@ -1,9 +1,9 @@
 """Uploads of samples in progress.
 
-They come in chunks, in order, are on disk without a name, and bounded in number and total size. A
-client may begin uploads and never finish them, so nothing of them is held in memory. When a bound
-is reached the oldest is dropped, and its sender's next chunk gets an error that says so. The files
-have no name, so a killed server leaves none behind.
+They come in chunks, in order, are on disk without a name, and bounded in number and total
+size. A client may begin uploads and never finish them, so nothing of them is held in
+memory. When a bound is reached the oldest is dropped, and its sender's next chunk gets an
+error about it. The files have no name, so a killed server leaves none behind.
 """
 
 from __future__ import annotations
@@ -77,11 +77,11 @@ class Incoming:
         """Write a chunk; return the bytes received so far.
 
         A chunk that has come before is passed over, so a client may send it again; a
-        chunk at 0 of another file under the same name begins anew.
+        chunk at 0 of another file under the same name begins a new upload.
 
         Raises:
             LimitError: a gap before this chunk, or the upload was dropped for newer ones.
-            DiskFullError: it would leave no room for what must be written.
+            DiskFullError: it would leave no room for state and jobs.
             DatasetWriteError: the disk does not take it; the upload is given up.
         """
         with self._lock:
@@ -110,7 +110,7 @@ class Incoming:
         """Read a complete upload and remove it from those under way.
 
         Raises:
-            LimitError: it is not whole, because another one was begun under its name.
+            LimitError: it is not complete, because another one was begun under its name.
         """
         with self._lock:
             known = self._open.get(name)

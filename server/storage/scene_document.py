@@ -1,6 +1,6 @@
-"""The scanner's part of what a twin server keeps: `Scene` of `document_messages`.
+"""The scanner's part of a twin server's state: `Scene` of `document_messages`.
 
-It is the document of scene.*; it is validated whole before any of it is applied.
+It is the document of scene.*; it is validated completely before any of it is applied.
 """
 
 from __future__ import annotations
@@ -67,7 +67,8 @@ def require_fit(scene: p.Scene, scanner: ScannerTwin) -> None:
 
     Raises:
         RpcError: -32602, another machine's.
-        UnknownNameError, LimitError: an axis, position or setting this scanner does not have.
+        UnknownNameError, LimitError: an axis, position or setting this scanner does not
+            have.
         GeometryError: a correction that no scanner can have.
     """
     if scene.machine != scanner.machine.name:
@@ -84,8 +85,8 @@ def require_fit(scene: p.Scene, scanner: ScannerTwin) -> None:
 
 
 def paces_of(scene: p.Scene, scanner: ScannerTwin) -> dict[str, tuple[float, float]]:
-    """Return motor -> (speed, acceleration): the scene's where it has them, else the
-    scanner's."""
+    """Return motor -> (speed, acceleration): the scene's where it has them,
+    else the scanner's."""
     return {
         axis: (scene.speeds.get(axis, speed), scene.accelerations.get(axis, acceleration))
         for axis, (speed, acceleration) in scanner.paces.items()

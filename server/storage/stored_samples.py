@@ -1,9 +1,9 @@
 """Samples: shipped phantoms by name, and uploaded meshes, voxels and scenes.
 
-Uploads appear only when whole and readable. They are stored under DATA/samples and survive a
-restart: the bytes in a file named after their content, and beside it a description, which is
-written last. Names become file names by percent encoding, so no name can leave that folder. An
-upload whose files are damaged is set aside.
+Uploads appear only when complete and readable. They are stored under DATA/samples and
+survive a restart: the bytes in a file named after their content, and beside it a
+description, which is written last. Names become file names by percent encoding, so no
+name can leave that folder. An upload whose files are damaged is set aside.
 """
 
 from __future__ import annotations
@@ -45,8 +45,7 @@ class ReceivedSample:
         raw: its bytes.
         phantom: parsed, of the material it was uploaded with.
         revision: names its content.
-        worn: material and phantom of another material, in which it is to stand on the
-            stage.
+        worn: material and phantom of another material, to be on the stage.
     """
 
     head: UploadHead
@@ -57,7 +56,7 @@ class ReceivedSample:
 
     @property
     def shown(self) -> str:
-        """Identifier of what it shows, as `SampleStore.revision` returns it."""
+        """Identifier of its appearance, as `SampleStore.revision` returns it."""
         return _shown(self.head, self.revision)
 
     @property
@@ -76,7 +75,7 @@ class SampleStore:
         limit: largest upload [bytes].
         most: uploads there may be.
         room: on the disk; None for any.
-        memory_limit: of what is parsed and kept [bytes]; None for any.
+        memory_limit: of the parsed samples in memory [bytes]; None for any.
     """
 
     def __init__(
@@ -93,7 +92,7 @@ class SampleStore:
         self._most = most
         self._incoming: Incoming = Incoming(folder, 2 * limit, room)
         self._heads: dict[str, UploadHead] = {}
-        """Their revisions are what their files say; those of older servers say nothing."""
+        """Their revisions are those of their files; those of older servers have none."""
         for file in own.ours(folder):
             without = "an upload cannot be read; without it"
             head = own.read_or_set_aside(folder, file, _head_of(file), without)
@@ -102,8 +101,8 @@ class SampleStore:
         self._revisions: dict[str, str] = {}
         self._loaded: dict[tuple[str, str | None], Phantom] = {}
         self.standing: Callable[[], tuple[str, str | None]] = lambda: ("", None)
-        """Name and material of what stands on the stage. It stays loaded: every state says
-        how large it is, and reading it anew may take seconds."""
+        """Name and material of the sample on the stage. It stays loaded: every state has
+        its size, and reading it again may take seconds."""
         self._lock = threading.Lock()
         """Guards the tables: samples are loaded by worker threads and by the event loop."""
         self.turn = asyncio.Lock()
@@ -127,8 +126,8 @@ class SampleStore:
         return self._heads.get(name)
 
     def revision(self, name: str) -> str | None:
-        """Return an identifier of what an upload that has been read shows; None for a
-        shipped phantom."""
+        """Return an identifier of the appearance of an upload that has been read; None
+        for a shipped phantom."""
         with self._lock:
             revision = self._revisions.get(name)
             head = self._heads.get(name)
@@ -153,7 +152,7 @@ class SampleStore:
             head = self._heads.get(name)
             phantom = self._loaded.pop(key, None)
             if phantom is not None:
-                self._loaded[key] = phantom  # the newest again: what is used stays
+                self._loaded[key] = phantom  # the newest again: used phantoms stay
                 return phantom
         phantom, revision = self._load(head, name, material)
         with self._lock:
@@ -177,7 +176,7 @@ class SampleStore:
 
         Raises:
             RpcError: -32008, larger than allowed.
-            LimitError: a gap before this chunk, or a name that stands for something else.
+            LimitError: a gap before this chunk, or a name with another meaning.
             DatasetWriteError: the disk does not take it.
         """
         if head.total > self._limit:
@@ -202,7 +201,7 @@ class SampleStore:
 
         Args:
             name: the upload's.
-            material: in which it is to stand on the stage, if not its own.
+            material: to be on the stage, if not its own.
 
         Raises:
             PhantomError, UnknownNameError: its content does not hold.
@@ -270,8 +269,8 @@ class SampleStore:
                 self._folder.unlink(file)
 
     def _settle(self) -> None:
-        """Clean the folder at the start: delete bytes without an upload, and what killed
-        writers left."""
+        """Clean the folder at the start: delete bytes without an upload, and the
+        rest of killed writers."""
         self._folder.sweep([TEMPORARY])
         known = {_bytes_file(name, head.revision) for name, head in self._heads.items()}
         there = self._folder.names()
@@ -335,8 +334,8 @@ def _revision(head: UploadHead, raw: bytes) -> str:
 
 
 def _shown(head: UploadHead, revision: str) -> str:
-    """Return an identifier of what an upload shows: the same content may come in another
-    material."""
+    """Return an identifier of an upload's appearance: the same content may come
+    in another material."""
     if head.material is None:
         return revision
     return f"{revision} {head.material}"
@@ -380,8 +379,8 @@ def _bytes_file(name: str, revision: str | None) -> str:
 
 
 def _head_of(file: str) -> Callable[[bytes], UploadHead]:
-    """Make the reader of an upload's description, which validates it as if it was
-    uploaded now."""
+    """Make the reader of an upload's description, which validates it as if it
+    was uploaded now."""
 
     def read(data: bytes) -> UploadHead:
         """Parse a description and check its name."""

@@ -1,11 +1,12 @@
 """How substances scatter X-rays: differential cross-sections of independent atoms, from tables.
 
-Coherent (Rayleigh) scattering is Thomson's times the square of the form factor F(x), incoherent
-(Compton) scattering Klein and Nishina's (Z. Phys. 52 (1929) 853) times the incoherent scattering
-function S(x); x = sin(theta / 2) / lambda [1/A]. F and S are Hubbell's (J. Phys. Chem. Ref. Data 4
-(1975) 471 and 8 (1979) 69) by way of EPDL97 and xraylib; `docs/tools/scattering_tables.py` made the
-file. The atoms of a compound scatter independently here: the interference between neighbouring
-atoms, which shapes coherent scattering below x = 0.3 in liquids, plastics and metals, is left out.
+Coherent (Rayleigh) scattering is Thomson's times the square of the form factor F(x),
+incoherent (Compton) scattering Klein and Nishina's (Z. Phys. 52 (1929) 853) times the
+incoherent scattering function S(x); x = sin(theta / 2) / lambda [1/A]. F and S are
+Hubbell's (J. Phys. Chem. Ref. Data 4 (1975) 471 and 8 (1979) 69) by way of EPDL97 and
+xraylib; `docs/tools/scattering_tables.py` made the file. The atoms of a compound scatter
+independently here: the interference between neighbouring atoms, which shapes coherent
+scattering below x = 0.3 in liquids, plastics and metals, is left out.
 """
 
 from __future__ import annotations
@@ -103,6 +104,6 @@ def cross_sections(substances: tuple[Substance, ...]) -> CrossSections:
     incoherent = [(np.interp(column, index, row) * klein_nishina).sum(axis=1) for row in shell]
     total = [one.attenuation() for one in substances]
     arrays = np.array(total), np.array(coherent), np.array(incoherent), form, shell, cumulated
-    for array in arrays:  # everybody has the same ones
+    for array in arrays:  # shared by all callers
         array.flags.writeable = False
     return CrossSections(energy, *arrays[:3], root_step, *arrays[3:])

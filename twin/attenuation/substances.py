@@ -1,9 +1,10 @@
 """Attenuation of a substance at each photon energy, from its chemical formula and density.
 
-Mixtures add up by mass fraction. An element without a shipped table is an error. `tables` has the
-shipped attenuation by element, and tungsten spectra by kV, on one energy grid;
-`docs/tools/physics_tables.py` made them, and their provenance travels inside the file. They are
-read once; spectra work on their bins, and one energy by itself is interpolated between edges.
+Mixtures add up by mass fraction. An element without a shipped table is an error. `tables`
+has the shipped attenuation by element, and tungsten spectra by kV, on one energy grid;
+`docs/tools/physics_tables.py` made them, and their provenance travels inside the file.
+They are read once; spectra work on their bins, and one energy by itself is interpolated
+between edges.
 """
 
 from __future__ import annotations
@@ -154,8 +155,8 @@ class Substance:
 
     @classmethod
     def called(cls, text: str) -> Substance:
-        """Look up a substance by the name of a sample's material, such as aluminium, or
-        parse FORMULA@DENSITY.
+        """Look up a substance by the name of a sample's material, such as
+        aluminium, or parse FORMULA@DENSITY.
 
         Raises:
             UnknownNameError: lists the materials there are; or an element without a
@@ -176,27 +177,27 @@ class Substance:
         return np.asarray(sum(part * tables().total[row] for row, part in self.parts))
 
     def attenuation(self) -> FloatArray:
-        """Compute the linear attenuation coefficient at the energies of the tables, (e,)
-        [1/mm]."""
+        """Compute the linear attenuation coefficient at the energies of the
+        tables, (e,) [1/mm]."""
         return self.mass_attenuation() * (self.density_g_cm3 / 10.0)
 
     def attenuation_at(self, energy_keV: float) -> float:
-        """Compute the linear attenuation coefficient at one energy [1/mm], on its side of
-        an edge."""
+        """Compute the linear attenuation coefficient at one energy [1/mm], on its
+        side of an edge."""
         mu = sum(part * _mass_at(row, energy_keV) for row, part in self.parts)
         return float(mu * self.density_g_cm3 / 10.0)
 
 
 def _mass_at(row: int, energy_keV: float) -> float:
-    """Interpolate mu/rho of an element [cm2/g], log-log from the two nearest bins with no
-    edge between."""
+    """Interpolate mu/rho of an element [cm2/g], log-log from the two nearest bins
+    with no edge between."""
     bins = tables().energy_keV
     edges = tables().edges_keV[row]
     total = tables().total[row]
     alike = np.searchsorted(edges, bins, "right") == np.searchsorted(edges, energy_keV, "right")
     away = np.abs(bins - energy_keV)
     near, far = np.argsort(np.where(alike, away, np.inf) if alike.any() else away)[:2]
-    slope = ABSORPTION_EXPONENT  # where only one bin lies between two edges
+    slope = ABSORPTION_EXPONENT  # if there is only one bin between two edges
     if alike[near] and alike[far]:
         slope = math.log(total[far] / total[near]) / math.log(bins[far] / bins[near])
     return float(total[near] * (energy_keV / bins[near]) ** slope)
@@ -206,7 +207,7 @@ def parse_formula(formula: str) -> dict[str, float]:
     """Parse a formula to symbol -> number of atoms. Parentheses and decimal counts are allowed.
 
     Raises:
-        LimitError: it cannot be read; says where.
+        LimitError: it cannot be read; names the place.
         UnknownNameError: an element the table does not have.
     """
     levels: list[dict[str, float]] = [{}]

@@ -1,4 +1,4 @@
-"""What touches what, and when: distances and sweeps over convex parts."""
+"""Contacts of bodies and their times: distances and sweeps over convex parts."""
 
 from flexdt.twin.collision.collision_scene import build_scene
 from flexdt.twin.collision.convex_solids import box

@@ -1,10 +1,11 @@
 """The collision scene of a machine: bodies on their chains, and the pairs that may not touch.
 
-It is built from the machine's bodies and the sample's pieces (see `stages`) and frozen afterwards.
-Pairs that are fixed to each other or allowed to touch are left out. Pairs that cannot meet at any
-position within reach (travel limits and a little more) are kept apart from the rest when they
-belong to one stage or run at different levels, so that "least clearance" describes possible
-contacts and not the construction of the machine. `relative` and `guard` add time.
+It is built from the machine's bodies and the sample's pieces (see `stages`) and frozen
+afterwards. Pairs that are fixed to each other or allowed to touch are left out. Pairs
+that cannot meet at any position within reach (travel limits and a little more) are kept
+apart from the rest when they belong to one stage or run at different levels, so that
+"least clearance" describes possible contacts and not the construction of the machine.
+`relative` and `guard` add time.
 """
 
 from __future__ import annotations
@@ -117,14 +118,14 @@ class CollisionScene:
         return PairStack.of(len(self.axes), self.bodies, (*self.pairs, *self.distant))
 
     def candidates(self, lower: FloatArray, upper: FloatArray) -> PairStack:
-        """Return the pairs to check while motors stay in [lower, upper]: the near ones,
-        or all."""
+        """Return the pairs to check while motors stay in [lower, upper]: the near
+        ones, or all."""
         within = (lower >= self.reach[:, 0]).all() and (upper <= self.reach[:, 1]).all()
         return self.near if within else self.all
 
     def path(self, trajectories: Mapping[str, Trajectory], start: float, end: float) -> Path:
-        """Make the path of all motors from `start` to `end` [s]; those left out stand at
-        home."""
+        """Make the path of all motors from `start` to `end` [s]; motors left out
+        are at home."""
         tables = {
             name: AxisPath.along(trajectories[name])
             if name in trajectories
@@ -134,7 +135,7 @@ class CollisionScene:
         return path_of(self.axes, tables, start, end)
 
     def vector(self, positions: Mapping[str, float]) -> FloatArray:
-        """Convert positions to (axes,) [mm, deg]; motors left out stand at home."""
+        """Convert positions to (axes,) [mm, deg]; motors left out are at home."""
         return np.array(
             [positions.get(n, h) for n, h in zip(self.axes, self.home.tolist(), strict=True)]
         )
@@ -214,7 +215,7 @@ def build_scene(
         machine: its components, limits, margin.
         profile: zero offsets, so that bodies sit where the X-ray geometry is.
         sample: convex pieces in the object's frame (see `convex_solids.convex_pieces`).
-        parameters: the correction in force; bodies sit where it says they are.
+        parameters: the correction in force; bodies are at the places that it gives.
         margin_mm: clearance to keep; default: the machine's.
     """
     axes = tuple(machine.axes)
@@ -247,7 +248,7 @@ def scene_of(
 
     Args:
         axes: motors, in the order of the bodies' columns.
-        bodies: what there is.
+        bodies: all bodies.
         allowed: pairs of names that may touch.
         reach: (axes, 2) positions for which pairs may be called distant.
         home: (axes,) positions of motors that a pose leaves out.

@@ -1,9 +1,10 @@
 """A sample's mesh as convex pieces that contain it, because collision solids must be convex.
 
-A mesh inside a mesh has a distance to it and would count as free. One hull contains any mesh; where
-that wastes room, the mesh is cut in halves and each half gets a hull of its own, as long as the
-hulls together shrink enough. The pieces always contain the solid, so a pose that is free of them is
-free; they may stop a motion that passes through a hollow. Meshes are not repaired.
+A mesh inside a mesh has a distance to it and would count as free. One hull contains any
+mesh; where that wastes room, the mesh is cut in halves and each half gets a hull of its
+own, as long as the hulls together shrink enough. The pieces always contain the solid, so
+a pose that is free of them is free; they may stop a motion that passes through a hollow.
+Meshes are not repaired.
 """
 
 from __future__ import annotations
@@ -117,7 +118,7 @@ def _clip(triangles: FloatArray, axis: int, at: float, side: float) -> FloatArra
         triangles: (n, 3, 3) corners [mm].
         axis: number of the coordinate axis across the plane.
         at: position of the plane [mm].
-        side: +1 keeps what is above it, -1 what is below.
+        side: +1 keeps the part above it, -1 the part below.
     """
     height = side * (triangles[:, :, axis] - at)
     count = (height >= 0.0).sum(axis=1)

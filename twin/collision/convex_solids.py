@@ -1,8 +1,8 @@
-"""Convex solids as values: what a collision body is made of, and its support in any direction.
+"""Convex solids as values: shape of a collision body, and its support in any direction.
 
-Two kinds are enough: the hull of points, and the upright cylinder. Each has a support function (how
-far it reaches in a direction), which is all that a proof of separation needs: for any direction n
-the gap between two supports is a lower bound of the distance.
+Two kinds are enough: the hull of points, and the upright cylinder. Each has a support
+function (how far it reaches in a direction), which is all that a proof of separation
+needs: for any direction n the gap between two supports is a lower bound of the distance.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ class ConvexSolid(Protocol):
         """Return a point of the solid farthest along each direction, (..., 3) both."""
 
     def support(self, directions: FloatArray) -> FloatArray:
-        """Compute the largest p . direction over the solid's points p, (...) [mm, for
-        unit directions]."""
+        """Compute the largest p . direction over the solid's points p, (...) [mm,
+        for unit directions]."""
         return np.asarray((directions * self.farthest(directions)).sum(axis=-1))
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """Return the lower and upper corner of the axis-aligned box around it, (3,) each
-        [mm]."""
+        """Return the lower and upper corner of the axis-aligned box around it,
+        (3,) each [mm]."""
 
     def radius_about(self, axis: FloatArray) -> float:
         """Compute the largest distance of any point from the line through the origin

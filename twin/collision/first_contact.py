@@ -1,7 +1,7 @@
-"""A whole scene along the motion of all its motors: first contact, least clearance, trace.
+"""A scene along the motion of all its motors: first contact, least clearance, trace.
 
-Pairs are taken in the order in which their swept boxes could be near, so that most are decided
-without computing a distance.
+Pairs are taken in the order in which their swept boxes could be near, so that most are
+decided without computing a distance.
 """
 
 from __future__ import annotations
@@ -72,8 +72,8 @@ class PathSearch:
 
     @cached_property
     def _nearest_first(self) -> tuple[list[Pair], list[float]]:
-        """Pairs that move relative to each other, and bounds of their clearances,
-        ascending [mm]."""
+        """Pairs that move relative to each other, and bounds of their
+        clearances, ascending [mm]."""
         lower = self.path.q.min(axis=0)
         upper = self.path.q.max(axis=0)
         stack = self.scene.candidates(lower, upper)
@@ -182,8 +182,8 @@ def touching(
 
 
 def bodies_touching(scene: CollisionScene, q: FloatArray) -> list[tuple[Pair, float]]:
-    """List every pair within the margin with the motors at `q` (axes,), with its
-    clearance [mm]."""
+    """List every pair within the margin with the motors at `q` (axes,), with
+    its clearance [mm]."""
     stack = scene.candidates(q, q)
     limit = scene.limits.margin + scene.limits.tolerance
     near = np.flatnonzero(stack.clearances(q, q) <= limit).tolist()
@@ -207,8 +207,8 @@ def clearance_trace(
 def _nearest(
     scene: CollisionScene, q: FloatArray, pairs: Sequence[Pair], bounds: FloatArray
 ) -> NearestPair:
-    """Find the nearest pair with the motors at `q`; `bounds` are lower bounds of the
-    clearances."""
+    """Find the nearest pair with the motors at `q`; `bounds` are lower bounds
+    of the clearances."""
     best = NearestPair(math.inf, None)
     for k in np.argsort(bounds, kind="stable").tolist():
         if bounds[k] >= best.mm:

@@ -1,7 +1,7 @@
 """The look-ahead of the scanner: given where every motor is bound, the first contact or None.
 
-A `SceneGuard` belongs to one scene: another sample, profile or correction is another guard. Bodies
-that overlap already may only come apart (`retreat.py`).
+A `SceneGuard` belongs to one scene: another sample, profile or correction is another
+guard. Bodies that overlap already may only come apart (`retreat.py`).
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ class SceneGuard:
     scene: CollisionScene
 
     def __call__(self, trajectories: Mapping[str, Trajectory], now: float) -> Contact | None:
-        """Find the first contact from `now` on; when nothing moves, the nearest pair that
-        touches.
+        """Find the first contact from `now` on; when nothing moves, the nearest
+        pair that touches.
 
         Args:
-            trajectories: motor -> trajectory; motors left out stand at home.
+            trajectories: motor -> trajectory; motors left out are at home.
             now: since when [s].
         """
         scene = self.scene
@@ -69,7 +69,7 @@ class SceneGuard:
         """Find the pairs of a pose within the safety margin, with their clearances [mm].
 
         Args:
-            positions: motor -> position; motors left out stand at home [mm, deg].
+            positions: motor -> position; motors left out are at home.
             deep: measure overlaps, as negative clearances; it takes some milliseconds a
                 pair.
         """

@@ -1,4 +1,4 @@
-"""Whether a machine file describes a machine that can stand at home and travel."""
+"""Check of a machine file: whether the machine can be at home and travel."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flexdt.twin.machine.kinematics import place
 
 
 def check_home(machine: Machine, profile: Profile, file: str) -> None:
-    """Check that the machine can stand at home: source, sample, panel in order, nothing touching.
+    """Check the machine at home: source, sample, panel in order, nothing touching.
 
     No motor may take the rotation axis or the panel behind the source.
 
@@ -23,7 +23,7 @@ def check_home(machine: Machine, profile: Profile, file: str) -> None:
         file: for the error.
 
     Raises:
-        MachineFileError: file, what is wrong, and where.
+        MachineFileError: file, problem and place.
     """
 
     def wrong(what: str, **data: object) -> MachineFileError:

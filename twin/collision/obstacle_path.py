@@ -1,10 +1,11 @@
-"""A free path to a target when the direct one collides: other orders of the axes, then a path
-around the obstacle.
+"""A free path to a target when the direct one collides: other orders of the axes, then a
+path around the obstacle.
 
-First all motors at once, then one after the other in any order, then with motors of the obstructing
-parts moving aside first (to the ends of their travel, home or the middle; turns by a quarter).
-Every proposed move has been swept. The search is a shortest-path search over such stations and
-returns the quickest path among them; None means only that none of those is free.
+First all motors at once, then one after the other in any order, then with motors of the
+obstructing parts moving aside first (to the ends of their travel, home or the middle;
+turns by a quarter). Every proposed move has been swept. The search is a shortest-path
+search over such stations and returns the quickest path among them; None means only that
+none of those is free.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ def free_moves(
     Args:
         scene: bodies and pairs that must not touch.
         machine: travel limits, speeds, accelerations.
-        start: positions of all motors (those left out stand at home) [mm, deg].
+        start: positions of all motors (those left out are at home) [mm, deg].
         targets: motors to move, absolute, within their travel.
         paces: motor -> (speed, acceleration); default: the machine's.
 

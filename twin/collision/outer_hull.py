@@ -1,7 +1,8 @@
 """A convex body of few corners around many points, for parts whose meshes have thousands.
 
-It is cut out of the points' box by planes on which the points' own hull lies, where it stands out
-most first; so it contains the hull, a pose that is free with it is free, and flat faces stay flat.
+It is cut out of the points' box by planes of the points' own hull, where it stands out
+most first; so it contains the hull, a pose that is free with it is free, and flat faces
+stay flat.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from flexdt.twin.machine.description import MAX_POINTS
 MAX_PLANES: Final = 2000
 """Largest number of planes of the points' hull that are used; any of them are valid."""
 MIN_CUT_MM: Final = 0.01
-"""Corners that stand out less are not cut off [mm]."""
+"""Smaller excess of a corner is not cut off [mm]."""
 PLANES_PER_CUT: Final = 8
 """Number of planes added at a time."""
 RELATIVE_LIFT: Final = 1e-9
@@ -57,7 +58,7 @@ def outer_hull(points: npt.ArrayLike) -> Polytope:
         taken = list[int]()
         while far.max() > MIN_CUT_MM and len(taken) < PLANES_PER_CUT:
             taken.append(int(np.argmax(out[np.argmax(far)])))
-            far[out[:, taken[-1]] > 0.0] = 0.0  # what a plane cuts off needs no second one
+            far[out[:, taken[-1]] > 0.0] = 0.0  # one plane is enough for these corners
         chosen += list(planes[taken] - [0.0, 0.0, 0.0, lift])
         cut = _corners(chosen, inside)
         if not taken or len(cut) > MAX_POINTS:

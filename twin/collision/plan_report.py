@@ -1,9 +1,9 @@
 """Collisions and clearances of a whole plan, for the dry-run report.
 
 A `CollisionCheck` for `flexdt.twin.script.dry_run` reports every contact of the plan with
-the line that moves, its time, the pair and the last free position, the least clearance, and a trace
-for a plot. After a contact the check continues with the plan as written, so that one mistake does
-not hide the next.
+the line that moves, its time, the pair and the last free position, the least clearance,
+and a trace for a plot. After a contact the check continues with the plan as written, so
+that one mistake does not hide the next.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ def collision_check(
 
     Args:
         sample: convex pieces in the object's frame (see `convex_pieces`). None: the
-            cylinder that the script or the caller says holds the sample (as high as it is
-            wide, where the height is unknown), or an empty stage.
+            cylinder that contains the sample by the script or the caller (as high as it
+            is wide, where the height is unknown), or an empty stage.
         parameters: the correction in force.
     """
 
@@ -59,8 +59,8 @@ def collision_report(plan: ScanPlan, scene: CollisionScene) -> Clearance:
     """Sweep a plan for its contacts and clearances.
 
     Args:
-        plan: what would run.
-        scene: what may touch what.
+        plan: bodies and pairs that must not touch.
+        scene: bodies and pairs that must not touch.
     """
     path = path_of(scene.axes, plan.paths, 0.0, plan.duration_s)
     search = PathSearch(scene, path)

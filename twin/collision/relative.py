@@ -1,22 +1,22 @@
 """The motion of one body relative to another along a path, and how far it is proved safe.
 
-Conservative advancement in path length: from a certified gap d across the direction n, the gap at a
-later time is at least d + n . (displacement) - (what turning can bring nearer), a quadratic in each
-segment of the path. `next_at` finds the first time at which that bound has fallen to a level; no
-contact can occur before it, so none is ever stepped over. For pure translations the bound is exact
-along n, so that grazing costs one evaluation.
+Conservative advancement in path length: from a certified gap d across the direction n,
+the gap at a later time is at least d + n . (displacement) - (approach by turning), a
+quadratic in each segment of the path. `next_at` finds the first time at which that bound
+has fallen to a level; no contact can occur before it, so none is ever stepped over. For
+pure translations the bound is exact along n, so that grazing costs one evaluation.
 
-A path is all motors over an interval of time, cut where any of them changes its acceleration.
-Within a segment every motor has constant acceleration and does not reverse, so its displacement is
-one quadratic.
+A path is all motors over an interval of time, cut where any of them changes its
+acceleration. Within a segment every motor has constant acceleration and does not reverse,
+so its displacement is one quadratic.
 
-`sweep_pair` finds the first contact and the least clearance of one pair of bodies along their
-relative motion. It advances from certified gap to certified gap, so motion that counts as free
-keeps the margin everywhere, not only where it was evaluated: clearance >= margin along everything
-before the reported contact. A contact is reported where the certified gap is within `tolerance` of
-the margin. A pair that is as near as that when a motion begins keeps to its floor instead
-(`twin.scanner.safety.floor`), which depends on the gap alone, so that no number of motions wears it
-down.
+`sweep_pair` finds the first contact and the least clearance of one pair of bodies along
+their relative motion. It advances from certified gap to certified gap, so motion that
+counts as free keeps the margin everywhere, not only where it was evaluated: clearance >=
+margin along everything before the reported contact. A contact is reported where the
+certified gap is within `tolerance` of the margin. A pair that is as near as that when a
+motion begins keeps to its floor instead (`twin.scanner.safety.floor`), which depends on
+the gap alone, so that no number of motions wears it down.
 """
 
 from __future__ import annotations
@@ -122,8 +122,9 @@ def path_of(axes: Sequence[str], tables: Mapping[str, AxisPath], start: float, e
     for column, name, table in moving:
         x0, v0, a0 = _state(table, begin)
         arrives = x0 + length * (v0 + 0.5 * a0 * length)
-        # The times themselves are rounded, also those of a programme that is slowed: its places are
-        # off by what the motor goes before it is. A clock that is late has coarse ones.
+        # The times themselves are rounded, also those of a programme that is slowed: its
+        # places are off by the distance that the motor moves in that time. A clock that
+        # is late has coarse ones.
         rounding = coarseness(begin[1:]) * float(np.abs(table.v).max())
         jumps = np.abs(arrives[:-1] - x0[1:]) > JUMP_TOLERANCE + rounding
         if jumps.any():
@@ -149,7 +150,7 @@ def _stands(table: AxisPath) -> bool:
 def _state(table: AxisPath, times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Compute position, velocity, acceleration in force from each of `times` (in order) on."""
     i = table.times.searchsorted(times, side="right") - 1
-    before, i = i < 0, np.maximum(i, 0)  # there it stands
+    before, i = i < 0, np.maximum(i, 0)  # it is at rest there
     dt, v0, a0 = np.where(before, 0.0, (times - table.times[i], table.v[i], table.a[i]))
     gained = a0 * dt
     return table.x[i] + dt * (v0 + 0.5 * gained), v0 + gained, a0
@@ -180,8 +181,8 @@ START = Moment(0, 0.0)
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """One distance evaluation: moment, certified gap [mm], its direction from b to a,
-    orientations."""
+    """One distance evaluation: moment, certified gap [mm], its direction from b
+    to a, orientations."""
 
     at: Moment
     gap: float
@@ -203,8 +204,8 @@ class _Bound:
     def first_fall(
         self, at: Moment, lengths: FloatArray, value: float, level: float
     ) -> Moment | None:
-        """Find the first moment from `at` on at which the bound, being `value` there,
-        reaches `level`."""
+        """Find the first moment from `at` on at which the bound, being `value`
+        there, reaches `level`."""
         lengths = lengths[at.segment :].copy()
         lengths[0] -= at.dt
         rate = self.rate[at.segment :].copy()
@@ -213,7 +214,7 @@ class _Bound:
         change = lengths * (rate + 0.5 * growth * lengths)
         ends = value + np.cumsum(change)
         dips = (rate < 0.0) & (rate + growth * lengths > 0.0)
-        # Where it turns round within a segment, its least value lies there.
+        # Where it reverses within a segment, its least value is there.
         depth = 0.5 * rate * rate / np.where(dips, growth, 1.0)
         reached = np.flatnonzero(np.where(dips, ends - change - depth, ends) <= level)
         if len(reached) == 0:
@@ -242,8 +243,8 @@ def _fall_time(above: float, rate: float, growth: float, length: float) -> float
 class _Turn:
     """The turning of one body over the segments: angle, rate, acceleration [rad].
 
-    `side` is the sign of the direction to the other body along the normal: -1 for a, +1 for b.
-    `nearing` is how far it turns in either sense.
+    `side` is the sign of the direction to the other body along the normal: -1 for a, +1
+    for b. `nearing` is how far it turns in either sense.
     """
 
     body: Body
@@ -269,11 +270,11 @@ class _Turn:
         rate = path.v @ body.turns
         growth = path.a @ body.turns
         after = rate + growth * np.diff(path.times)
-        # A path is cut where a motor turns round. There rounding may leave a velocity that still
-        # points the old way; the acceleration tells.
+        # A path is cut where a motor turns round. There rounding may leave a velocity
+        # that still points the old way; the acceleration decides.
         rounding = np.abs(growth) * (MIN_SEGMENT_S + coarseness(path.times[:-1]))
         signs = np.sign(np.where(np.abs(rate) > rounding, rate, growth))
-        # What several turntables carry may turn round within a segment: it turns no faster there.
+        # Bodies on several turntables may reverse within a segment: it turns no faster there.
         both = (rate * after < 0.0) & (np.minimum(np.abs(rate), np.abs(after)) > rounding)
         fastest = np.maximum(np.abs(rate), np.abs(after))
         nearing = _Bound(
@@ -303,8 +304,8 @@ class _Turn:
     def lever(
         self, normal: FloatArray, orientation: FloatArray, allowance: float
     ) -> tuple[float, float]:
-        """Compute (mm per rad, rad): within that turn the solid approaches by no more per
-        radian.
+        """Compute (mm per rad, rad): within that turn the solid approaches by no
+        more per radian.
 
         The nearing along a fixed normal is a convex function of the turn, so a chord is a
         bound.
@@ -318,7 +319,8 @@ class _Turn:
 
 
 class RelativeMotion:
-    """Body `a` as seen from body `b` over the segments in which they move relative to each other.
+    """Body `a` as seen from body `b` over the segments in which they move relative
+    to each other.
 
     Args:
         a: one body.
@@ -349,8 +351,8 @@ class RelativeMotion:
         self._leave_out_repeated_turns()
 
     def _leave_out_repeated_turns(self) -> None:
-        """Shorten segments in which one body turns evenly in place: later turns repeat
-        the first.
+        """Shorten segments in which one body turns evenly in place: later turns
+        repeat the first.
 
         Whole turns are taken out of such segments, so they end in the pose they ended in.
         """
@@ -422,8 +424,8 @@ class RelativeMotion:
         return _Bound(-begin, -growth)
 
     def nearest_end(self, look: Look) -> Moment:
-        """Find the segment end after a look that is farthest towards b along its normal,
-        unturned."""
+        """Find the segment end after a look that is farthest towards b along
+        its normal, unturned."""
         i = look.at.segment
         slide = self._slide(look.normal)
         lengths = self.lengths[i:]
@@ -491,7 +493,7 @@ def sweep_pair(
         separate: their certified clearance in a pose.
         limits: margin, tolerance.
         start: where to begin.
-        until: what happens after this time does not matter [s].
+        until: end of the sweep [s].
     """
     level = floor(math.inf, limits.margin)
     near = limits.margin + limits.tolerance
@@ -530,8 +532,8 @@ def sweep_pair(
 def refine_pair(
     motion: RelativeMotion, separate: Separate, limits: Limits, best: float
 ) -> tuple[float, int]:
-    """Refine the least clearance of a pair that is known to be free, if it is below
-    `best` [mm].
+    """Refine the least clearance of a pair that is known to be free, if it is
+    below `best` [mm].
 
     Returns:
         A clearance that occurs, not more than `limits.slack` above the least (`best` if

@@ -1,16 +1,17 @@
 """Bodies that overlap already (after a restart) may only come apart: a retreat.
 
-A sweep cannot measure how deep two bodies overlap, so every motion that begins in an overlap would
-be a contact, a retreat included. Here such a pair is judged by its separation: the gap between the
-two bodies across a direction, the widest of all directions, negative for an overlap. Where the
-motion begins it is exact, from the faces of the bodies' Minkowski difference; later the same
-directions are looked at, standing and turning with either body, which can only make the separation
-seem less than it is. As long as it keeps to its floor the motion is a retreat, and from the moment
-the pair is free the usual margin applies to it again. All other pairs keep the margin throughout.
+A sweep cannot measure how deep two bodies overlap, so every motion that begins in an
+overlap would be a contact, a retreat included. Here such a pair is judged by its
+separation: the gap between the two bodies across a direction, the widest of all
+directions, negative for an overlap. Where the motion begins it is exact, from the faces
+of the bodies' Minkowski difference; later the same directions are looked at, standing and
+turning with either body, which can only make the separation seem less than it is. As long
+as it keeps to its floor the motion is a retreat, and from the moment the pair is free the
+usual margin applies to it again. All other pairs keep the margin throughout.
 
-Both moments are found by conservative advancement, so that none is stepped over: the separation is
-looked at again where it may have fallen to the floor, the distance where it may have grown to what
-counts as free.
+Both moments are found by conservative advancement, so that none is stepped over: the
+separation is evaluated again where it may have fallen to the floor, the distance where it
+may have grown to that of a free pair.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ def leaving(scene: CollisionScene, path: Path) -> Contact | None:
     """Find the first contact of a motion that begins with bodies overlapping, or None.
 
     Args:
-        scene: what may touch what.
+        scene: bodies and pairs that must not touch.
         path: the motion.
     """
     stuck = [pair for pair, gap in bodies_touching(scene, path.q[0]) if gap <= GRAZING_MM]
@@ -65,8 +66,8 @@ def leaving(scene: CollisionScene, path: Path) -> Contact | None:
 
 
 def _of_pair(scene: CollisionScene, path: Path, pair: Pair) -> Contact | None:
-    """Find the contact that stops one overlapping pair: coming closer, or touching again
-    once free."""
+    """Find the contact that stops one overlapping pair: coming closer, or touching
+    again once free."""
     a, b = (scene.bodies[i] for i in pair)
     motion = RelativeMotion(a, b, path)
     overlap = _Overlap.at(a, b, path.q[0])
@@ -86,8 +87,8 @@ def _of_pair(scene: CollisionScene, path: Path, pair: Pair) -> Contact | None:
 def _deeper(
     motion: RelativeMotion, overlap: _Overlap, margin: float
 ) -> tuple[Moment, Moment] | None:
-    """Find when the separation falls to its floor: (last look before, moment); None for
-    never."""
+    """Find when the separation falls to its floor: (last look before, moment);
+    None for never."""
     look = motion.look(START, overlap.separate)
     level = floor(look.gap, margin)
     while (at := motion.next_at(look, level)) is not None:
@@ -101,8 +102,8 @@ def _deeper(
 def _free_from(
     motion: RelativeMotion, separate: Separate, limits: Limits, until: float
 ) -> float | None:
-    """Find when the two exceed the margin by twice the tolerance, before `until`; else
-    None [s].
+    """Find when the two exceed the margin by twice the tolerance, before `until`;
+    else None [s].
 
     Where they are not clear by one tolerance, the other one has yet to be travelled, so
     that every look is that far from the one before.
@@ -128,8 +129,8 @@ def _without(scene: CollisionScene, pairs: list[Pair]) -> CollisionScene:
 
 @dataclass(frozen=True, eq=False)
 class _Overlap:
-    """Two bodies that overlap at the beginning, and the directions across which they may
-    separate.
+    """Two bodies that overlap at the beginning, and the directions across which
+    they may separate.
 
     Attributes:
         bodies: the two.
@@ -172,8 +173,8 @@ class _Overlap:
     def separate(
         self, offset: FloatArray, turn_a: FloatArray | None, turn_b: FloatArray | None
     ) -> Separation:
-        """Compute the widest slab between the bodies [mm] and its direction, as
-        `relative.Separate`.
+        """Compute the widest slab between the bodies [mm] and its
+        direction, as `relative.Separate`.
 
         The width is negative for an overlap, and never too large. Looked at are
         directions that turn with either body. How far that body reaches across them does

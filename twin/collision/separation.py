@@ -1,9 +1,10 @@
 """The distance of two convex solids with a certificate; the one module that wraps python-fcl.
 
-fcl proposes the nearest points; the clearance that counts is then computed from the two solids'
-supports along that direction, a lower bound of the true distance whatever fcl said. So an error of
-the library can stop a motion too early but never call a touch free. fcl is imported when the first
-pair is made. Its continuous collision (which misses contacts) is not used.
+fcl proposes the nearest points; the clearance that counts is then computed from the two
+solids' supports along that direction, a lower bound of the true distance whatever fcl
+returned. So an error of the library can stop a motion too early but never call a touch
+free. fcl is imported when the first pair is made. Its continuous collision (which misses
+contacts) is not used.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from flexdt.twin.collision.convex_solids import ConvexSolid, Polytope, UprightCy
 from flexdt.twin.geometry.conventions import FloatArray
 
 Separation = tuple[float, FloatArray]
-"""Certified clearance [mm], 0 when they touch or overlap, and the unit direction from b to a."""
+"""Certified clearance [mm], 0 when they touch or overlap, and the unit direction
+from b to a."""
 
 _IDENTITY = np.eye(3)
 _ORIGIN = np.zeros(3)
@@ -51,7 +53,7 @@ def separation_of(
         offset: FloatArray, turn_a: FloatArray | None, turn_b: FloatArray | None
     ) -> Separation:
         """Separate the two solids in a pose; thread-safe."""
-        # Nothing is shared that changes: several threads may ask at once.
+        # Nothing is shared that changes: several threads may call at once.
         ra, rb = (_IDENTITY if turn is None else turn for turn in (turn_a, turn_b))
         object_a = fcl.CollisionObject(shape_a, fcl.Transform(ra, offset + ra @ shift_a))
         object_b = still_b
@@ -84,8 +86,8 @@ def _improved(
     ra: FloatArray,
     rb: FloatArray,
 ) -> Separation:
-    """Improve a certificate by Gilbert's search for the nearest point of the hull of all
-    differences.
+    """Improve a certificate by Gilbert's search for the nearest point of the hull
+    of all differences.
 
     fcl is off by millimetres where two edges are parallel, as those of upright boxes are.
 
@@ -107,7 +109,7 @@ def _improved(
         system = np.vstack([points, np.full(len(corners), 100.0)])
         try:
             weights, _ = nnls(system, [0.0, 0.0, 0.0, 100.0])
-        except RuntimeError:  # not within its rounds: what was found so far is a certificate, too
+        except RuntimeError:  # not within its rounds: the last result is a certificate, too
             break
         nearest = points @ weights / weights.sum()
         length = math.sqrt(nearest @ nearest)

@@ -1,15 +1,16 @@
 """A machine's components and its sample as bodies, placed as the X-ray geometry is.
 
-The machine's linear map gives the motors that slide each part; zero offsets of the profile and a
-correction in force shift every part along the directions in which its motors move it, so focal
-spot, panel and sample sit exactly where `kinematics.poses` and `Poses.cone_vec` put them. Panel and
-sample follow a correction's tilts too; the parts that carry them stay upright. `collision_scene`
-decides which of the bodies may touch.
+The machine's linear map gives the motors that slide each part; zero offsets of the
+profile and a correction in force shift every part along the directions in which its
+motors move it, so focal spot, panel and sample sit exactly where `kinematics.poses` and
+`Poses.cone_vec` put them. Panel and sample follow a correction's tilts too; the parts
+that carry them stay upright. `collision_scene` decides which of the bodies may touch.
 
-A `Body` is a convex solid carried by motors, as one linear map and at most one turn. The origin of
-its frame slides linearly with the motors; the solid turns about a line through that origin. A
-body's pose is therefore a closed form of the motor positions, however long the kinematic chain is.
-Motors are columns of arrays, in the scene's order and the script's units (mm, deg).
+A `Body` is a convex solid carried by motors, as one linear map and at most one turn. The
+origin of its frame slides linearly with the motors; the solid turns about a line through
+that origin. A body's pose is therefore a closed form of the motor positions, however long
+the kinematic chain is. Motors are columns of arrays, in the scene's order and the
+script's units (mm, deg).
 """
 
 from __future__ import annotations
@@ -54,8 +55,8 @@ class Body:
         turns: (axes,) turn per unit of each motor [rad].
         spin_axis: (3,) unit direction of the turn.
         group: bodies with the same group are fixed to each other.
-        stage: source, object or detector: bodies of different stages are of interest to each
-            other even where no travel can bring them together.
+        stage: source, object or detector: bodies of different stages are of interest to
+            each other even where no travel can bring them together.
     """
 
     name: str
@@ -69,8 +70,8 @@ class Body:
 
     @cached_property
     def reach(self) -> float:
-        """Largest distance of a point from the spin axis [mm]; 0 where turning changes
-        nothing."""
+        """Largest distance of a point from the spin axis [mm]; 0 where
+        turning changes nothing."""
         if not self.turns.any() or self.solid.is_round(self.spin_axis):
             return 0.0
         return self.solid.radius_about(self.spin_axis)
@@ -94,8 +95,8 @@ class Body:
         return ends.min(axis=0) - across, ends.max(axis=0) + across
 
     def turn_until(self, toward: FloatArray, allowance: float, sense: float) -> float:
-        """Compute how far the body may turn before its support along `toward` grows by
-        `allowance` [rad].
+        """Compute how far the body may turn before its support along `toward` grows
+        by `allowance` [rad].
 
         Args:
             toward: (3,) unit direction in the body's turned frame.
@@ -165,9 +166,9 @@ def sample_bodies(
 ) -> list[Body]:
     """Place the sample's pieces as bodies on the component whose role is `sample_holder`.
 
-    A point b of a piece stands at c + T R(alpha + angle_scale * angle) (b + mount - tau),
-    the map of `Poses.cone_vec`; a piece is as large as all that a stage on the turntable
-    can sweep with it.
+    A point b of a piece is at c + T R(alpha + angle_scale * angle) (b + mount - tau), the
+    map of `Poses.cone_vec`; a piece is as large as all that a stage on the turntable can
+    sweep with it.
     """
     holder = next((c for c in machine.components if c.role == "sample_holder"), None)
     if holder is None:
@@ -175,7 +176,8 @@ def sample_bodies(
     p = parameters
     shifts = _shifts(machine, profile, p)
     _, slides, turns = _chain(machine, holder, shifts)
-    # All offsets count, as in `Poses.cone_vec`: also where no motor of this machine moves the axis.
+    # All offsets count, as in `Poses.cone_vec`: also where no motor of this machine moves
+    # the axis.
     origin = shifts["object"] + np.array([0.0, 0.0, machine.sample_height_mm])
     tilt = rotation_y(p.axis_tilt_z) @ rotation_x(p.axis_tilt_x)
     place = tilt @ stage_rotation(p.alpha)
@@ -255,9 +257,8 @@ def _chain(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Compute origin, slides and turns of a component's frame.
 
-    An offset belongs to the motor's reading, so it moves what the motor moves and no
-    more; what is fixed stands at its anchor, and what has a role where the X-ray geometry
-    has it.
+    An offset belongs to the motor's reading, so it moves the same parts as the motor; a
+    fixed part is at its anchor, and one with a role where the X-ray geometry has it.
     """
     chain = machine.chain(part)
     columns = {name: i for i, name in enumerate(machine.axes)}

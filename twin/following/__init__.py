@@ -1,1 +1,2 @@
-"""A real machine followed by its messages: what is known of it, and what is not as predicted."""
+"""A real machine followed by its messages: what is known of it, and what is
+not as predicted."""

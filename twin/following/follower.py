@@ -1,15 +1,16 @@
-"""What a message, or time that passes, changes in what is known of a followed machine.
+"""Changes of the knowledge about a followed machine by a message, or by time.
 
-Every function returns another `Mirror`; sockets, files and clocks belong to who calls. A command
-is predicted when it is heard, from the machine as it is known at that moment, by the simulation
-that plans scripts. A reading of a moving motor is compared with the predicted path as a delay: when
-the path passes that position, and how long ago. A motor that starts late has a constant delay, one
-that is slow a growing one, whatever the machine's overhead. What may have come before it was read
-counts as early or as late as is better for the machine.
+Every function returns another `Mirror`; sockets, files and clocks belong to the caller. A
+command is predicted when it is heard, from the machine as it is known at that moment, by
+the simulation that plans scripts. A reading of a moving motor is compared with the
+predicted path as a delay: when the path passes that position, and how long ago. A motor
+that starts late has a constant delay, one that is slow a growing one, whatever the
+machine's overhead. The time of arrival is uncertain by the delay of reading, and the
+value that is better for the machine is used.
 
-Servers differ in what they tell. Replies belong to commands by their UUID; what comes twice, or
-after the end, changes nothing; an end that a server never tells, and feedback that it never gives,
-are missed once.
+Servers differ in their replies. Replies belong to commands by their UUID; a repeated
+message, or one after the end, changes nothing; a missing end, and missing feedback, raise
+one alarm.
 """
 
 from __future__ import annotations
@@ -43,8 +44,8 @@ SLACK_S: Final = 0.3
 MAX_DRIFT_S: Final = 0.25
 """Largest growth of the delay behind the predicted path during a move [s]."""
 MAX_SILENCE_S: Final = 2.5
-"""Longest silence about a command under way [s]; the interface asks for one message a
-second."""
+"""Longest silence about a command under way [s]; the interface requires one
+message a second."""
 FORGOTTEN_AFTER_S: Final = 60.0
 """Silence, beyond its range, after which a command has no end any more [s]."""
 WIDENING_WIDTHS: Final = 3.0
@@ -72,8 +73,8 @@ class Follower:
     Args:
         machine: predicts: limits, rates, times, bodies.
         profile: zero offsets, for the bodies.
-        script: what is expected to run; None for anything.
-        sample: its size, for what is ahead.
+        script: the expected script; None for anything.
+        sample: its size, for the check of the rest.
         collision: finds contacts; None leaves them unchecked.
 
     Example:
@@ -120,7 +121,7 @@ class Follower:
         return self._ended(mirror, heard, waiting, now)
 
     def tick(self, mirror: Mirror, now: float) -> Mirror:
-        """Update the mirror after time without a message: raise alarms for what is overdue."""
+        """Update the mirror after time without a message: raise alarms for overdue commands."""
         mirror = self._over(mirror, "", now) if mirror.ends is False else mirror
         for waiting in mirror.waiting.values():
             took = now - waiting.sent_s
@@ -170,8 +171,8 @@ class Follower:
     def ahead(self, mirror: Mirror, now: float) -> tuple[Alarm, ...]:
         """Check the moves under way and the rest of the script, as `flexdt check` does.
 
-        This takes as long as that. Motors that have not been heard of are assumed at
-        home, and each alarm says so.
+        This takes as long as that. Motors without a reading are assumed at home, which
+        each alarm mentions.
 
         Args:
             mirror: the machine as it is known.
@@ -211,8 +212,8 @@ class Follower:
     # -- commands ----------------------------------------------------------------------------
 
     def _sent(self, mirror: Mirror, heard: Heard, now: float) -> Mirror:
-        """Update the mirror with a command: prediction, place in the script, command
-        under way."""
+        """Update the mirror with a command: prediction, place in the script,
+        command under way."""
         again = (i for i in mirror.waiting if (i[0], i[2]) == (heard.key, heard.words))
         if any(again) or (heard.named and heard.identity in mirror.ended):
             return mirror
@@ -471,7 +472,7 @@ class Follower:
             last = mirror.ends is False and now > path.end > seen.passed_s
             return here if last else mirror
         if moves and passes == seen.passed_s and now - (seen.heard_s or now) < MAX_SILENCE_S:
-            return mirror  # that one once more
+            return mirror  # a repeated reading
         if arrived or abs(x - path.pieces[0].position) <= TARGET_TOLERANCE:
             if passes is None:
                 return here
@@ -544,8 +545,8 @@ def _stays(mirror: Mirror, name: str, waiting: Waiting) -> bool:
 
 
 def _bare(command: c.Command) -> c.Command:
-    """Strip a command of its place in the text, its wait, its times and the case of its
-    axis."""
+    """Strip a command of its place in the text, its wait, its times and the
+    case of its axis."""
     bare = replace(command, line=0, column=1, wait=c.Wait.ACK, timeout_ms=None, expected_ms=None)
     if isinstance(bare, c.MotorCommand):
         bare = replace(bare, component=bare.component.lower())

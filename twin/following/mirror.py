@@ -1,8 +1,7 @@
-"""What is known of a followed machine at one moment: plain, frozen values.
+"""The knowledge about a followed machine at one moment: plain, frozen values.
 
-Positions are in the script's sign and unit (mm, deg); times are those of whoever listens [s].
-Nothing here is older or younger than the messages that it came from, and each value says when it
-was heard.
+Positions are in the script's sign and unit (mm, deg); times are those of the listener
+[s]. Every value is as old as the message that it came from, and has its time.
 """
 
 from __future__ import annotations
@@ -38,9 +37,10 @@ class Heard:
         words: component, command, argument 1 and 2, as they came.
         command: the same, typed; None where it is none of a script.
         reply: text of a reply; of a cluster one character for each byte.
-        asks: of a question, what its answer is: `position`, `kV`...
+        asks: of a question, the quantity of its answer: `position`, `kV`...
         stamp: time of day at which it came, hh:mm:ss.mmm, for the record.
-        tick: the sender's clock, copied into replies by some programs and renewed by others.
+        tick: the sender's clock, copied into replies by some programs and renewed by
+            others.
         late_s: by how much earlier it may have come than it was read [s].
     """
 
@@ -65,8 +65,8 @@ class Heard:
         return self.key != " ".join(self.words[:2])
 
     def may_answer(self, command: Identity) -> bool:
-        """Return whether this can be a reply to a command, by its UUID, or else by its
-        words."""
+        """Return whether this can be a reply to a command, by its UUID, or else
+        by its words."""
         same = self.words[2:] in (command[2][2:], ("", ""))
         return command[0] == self.key and (self.named or same)
 
@@ -82,11 +82,11 @@ class Alarm:
 
     Attributes:
         at_s: when it was noticed.
-        severity: `warning` for what happens on a good day (one time in ten lies outside a 90 %
-            range), `error` for what does not.
-        kind: `limit`, `limits`, `limit_near`, `offset`, `moved`, `slow`, `fast`, `off_path`,
-            `range`, `late`, `collision`, `clearance`, `failed`, `off_script`, `unknown_axis`,
-            `silent`, `lost`, or a code of `flexdt check`.
+        severity: `warning` for a healthy machine's deviations (one time in ten is outside
+            a 90 % range), `error` for others.
+        kind: `limit`, `limits`, `limit_near`, `offset`, `moved`, `slow`, `fast`,
+            `off_path`, `range`, `late`, `collision`, `clearance`, `failed`, `off_script`,
+            `unknown_axis`, `silent`, `lost`, or a code of `flexdt check`.
         about: axis, component or line that it is about.
         message: one readable line.
     """
@@ -104,13 +104,14 @@ class SeenAxis:
 
     Attributes:
         position: heard last, or home where `heard_s` is None.
-        target: where it stands or is bound for.
+        target: its place at rest, or its target.
         speed, acceleration: in force for moves to come.
         heard_s: when the position was heard; None: never, so it is assumed.
         path: predicted motion, in the listener's time; None at rest.
         mover: the command that `path` is of.
         begun_s: how much earlier than `path` it may have begun [s].
-        delay_s: by how much it may be behind `path`: the most that a move takes beyond its motion.
+        delay_s: by how much it may be behind `path`: the most that a move takes beyond
+            its motion.
         passed_s: the latest moment of `path` that a reading has shown.
         behind_s: (at least, at most) by how much the promptest reading was behind `path`.
     """
@@ -162,17 +163,19 @@ class Mirror:
         xrays_on: None until heard.
         ready_s: when X-rays are predicted to be ready.
         waiting: commands without an end yet, oldest first.
-        ended: commands that have ended, oldest first, and whether only their end was heard.
-        ends: whether commands are told to end; None until one has been heard to, False once one
-            was overdue before.
-        speaks: whether commands that last are told of once a second; False once one was not.
+        ended: commands that have ended, oldest first, and whether only their end was
+            heard.
+        ends: whether the server reports the end of commands; None until one has been
+            heard to, False once one was overdue before.
+        speaks: whether the server reports long commands once a second; False once one was
+            not.
         heard_s: when the last message came.
         connected: whether there is a link.
         alarms: the newest, oldest first; `raised` counts all.
-        active: (kind, about) of conditions that hold and are not told again.
-        next_line: index of the script's next command; `began_s` when its first was heard, and
-            `due_s` by when the next is sent, nine of ten times.
-        lines: what the last message adds to the record.
+        active: (kind, about) of conditions that hold and are not reported again.
+        next_line: index of the script's next command; `began_s` when its first was heard,
+            and `due_s` by when the next is sent, nine of ten times.
+        lines: additions of the last message to the record.
     """
 
     axes: Mapping[str, SeenAxis]

@@ -1,9 +1,10 @@
 """The cone-beam geometry as a value: n rows of twelve numbers, exactly ASTRA's `cone_vec`.
 
-A row is source, detector centre, u (step to the next column), v (step to the next row), in mm and
-in the object's frame (see `conventions`). A geometry may carry the number of its detector's pixels;
-methods that need it take it as an argument otherwise, and an argument that contradicts it is an
-error. Files, other programs' objects and figures are the library's (`flexdt.twin.backends`).
+A row is source, detector centre, u (step to the next column), v (step to the next row),
+in mm and in the object's frame (see `conventions`). A geometry may carry the number of
+its detector's pixels; methods that need it take it as an argument otherwise, and an
+argument that contradicts it is an error. Files, other programs' objects and figures are
+the library's (`flexdt.twin.backends`).
 """
 
 from __future__ import annotations
@@ -51,8 +52,8 @@ class ConeVec:
         detector_shape: (rows, cols) of the detector, or None.
 
     Raises:
-        GeometryError: the rows do not have twelve finite numbers each, or the detector has no
-            pixels.
+        GeometryError: the rows do not have twelve finite numbers each, or the detector
+            has no pixels.
 
     Example:
         >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(760, 956), pixel=0.1496)
@@ -207,7 +208,8 @@ class ConeVec:
             raise GeometryError.instead(asked, list(pitch), "more than 0")
         right = np.array(COLUMN_DIRECTION)
         below = np.array(ROW_DIRECTION)
-        # At stage angle 0; the object turns clockwise, so these turn the other way in its frame.
+        # At stage angle 0; the object turns clockwise, so these turn the other way in its
+        # frame.
         source = np.array([0.0, -sod, height])
         centre = np.array([0.0, sdd - sod, height]) + columns * right + down * below
         u, v = turn_detector(right * pitch[0], below * pitch[1], yaw, tilt, roll)
@@ -225,7 +227,7 @@ class ConeVec:
 
         Args:
             geometry: vectors (n, 12) [mm], or a dictionary of type `cone` or `cone_vec`.
-            shape: detector (rows, cols), for vectors, which do not say.
+            shape: detector (rows, cols), for vectors, which do not contain it.
 
         Raises:
             GeometryError: another type or form.
@@ -240,8 +242,8 @@ class ConeVec:
         return found
 
     def to_astra(self) -> dict[str, Any]:
-        """Convert to ASTRA's projection geometry of type `cone_vec`; needs the detector's
-        shape.
+        """Convert to ASTRA's projection geometry of type `cone_vec`; needs
+        the detector's shape.
 
         Example:
             >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=9, shape=(76, 96), pixel=0.15)
@@ -269,8 +271,8 @@ class ConeVec:
         return found
 
     def to_tomosipo(self) -> Any:
-        """Convert to tomosipo's `ts.cone_vec` geometry; needs tomosipo and the detector's
-        shape."""
+        """Convert to tomosipo's `ts.cone_vec` geometry; needs tomosipo and
+        the detector's shape."""
         return _formats().to_tomosipo(self)
 
     def to_cil(self) -> Any:
@@ -292,15 +294,15 @@ class ConeVec:
                 dVoxel and sVoxel to you.
 
         Raises:
-            TwinError: skew pixels, several pixel sizes, no shape, a panel that lies flat,
-                an object that is not between source and panel; TIGRE is not installed.
+            TwinError: skew pixels, several pixel sizes, no shape, a horizontal panel, an
+                object that is not between source and panel; TIGRE is not installed.
         """
         found: tuple[Any, FloatArray] = _formats().to_tigre(self, like)
         return found
 
     def to_leap(self, like: Any = None, *, rows_up: bool = False) -> Any:
-        """Make LEAP's model with this scan as its modular beam; needs LEAP and the
-        detector's shape.
+        """Make LEAP's model with this scan as its modular beam; needs LEAP and
+        the detector's shape.
 
         Args:
             like: a `Grid` or `Volume` whose voxels LEAP takes; None is LEAP's own choice.
@@ -318,8 +320,8 @@ class ConeVec:
     def from_rtk(
         cls, file: File, *, pixel: float | Sequence[float], shape: Shape2 | None = None
     ) -> ConeVec:
-        """Read RTK's circular geometry from its XML file, which has neither pixel size
-        nor shape.
+        """Read RTK's circular geometry from its XML file, which has neither pixel
+        size nor shape.
 
         Args:
             file: the path.
@@ -369,15 +371,15 @@ class ConeVec:
         """Load a geometry from a file.
 
         Args:
-            file: the path; its ending says the format, where `format` does not: .json
+            file: the path; its ending determines the format unless `format` does: .json
                 (flexdt or CTSimU), .npy, .txt (ASTRA's vectors), .npz (tomosipo), .cil,
                 .tigre, .leap, .csv, .xml (RTK), .toml (flexDATA).
             format: ctsimu, rtk, astra, tomosipo, cil, tigre, leap, flexdata or csv.
-            shape: detector (rows, cols), where the file does not say.
-            pixel: pitch of the pixels [mm], where the file does not say.
+            shape: detector (rows, cols), if the file does not contain it.
+            pixel: pitch of the pixels [mm], if the file does not contain it.
 
         Raises:
-            TwinError: the file does not hold, or contradicts what is given.
+            TwinError: the file is invalid, or contradicts the arguments.
             OSError: it cannot be read.
 
         Example:
@@ -392,7 +394,8 @@ class ConeVec:
         return found
 
     def save(self, file: File, *, format: str | None = None) -> None:
-        """Write a file that `load` reads; its ending says the format, where `format` does not.
+        """Write a file that `load` reads; its ending determines the format
+        unless `format` does.
 
         Raises:
             TwinError: the format cannot carry this geometry, or the ending is not known.
@@ -555,8 +558,8 @@ class ConeVec:
         return replace(self, detector_shape=shape)
 
     def plot(self, axes: Any = None) -> Any:
-        """Plot source, detector and rays in three dimensions; needs matplotlib (the extra
-        `plots`).
+        """Plot source, detector and rays in three dimensions; needs matplotlib
+        (the extra `plots`).
 
         Args:
             axes: matplotlib's 3D axes to draw into; None makes a figure.
@@ -596,14 +599,15 @@ class ConeVec:
 
     @property
     def normal(self) -> FloatArray:
-        """Unit normal u x v of each view, (n, 3): away from the source where v points downwards."""
+        """Unit normal u x v of each view, (n, 3): away from the source
+        where v points downwards."""
         n = np.cross(self.u, self.v)
         return np.asarray(n / np.linalg.norm(n, axis=1, keepdims=True), dtype=np.float64)
 
     @property
     def source_detector_distance(self) -> FloatArray:
-        """Distance of the focal spot from the detector plane along `normal`, (n,) [mm]: negative
-        where v points upwards, as in ASTRA's `cone`."""
+        """Distance of the focal spot from the detector plane along `normal`, (n,) [mm]:
+        negative where v points upwards, as in ASTRA's `cone`."""
         return np.asarray(np.sum((self.detector - self.source) * self.normal, axis=1))
 
     def rays(self, shape: Shape2 | None = None) -> FloatArray:
@@ -632,8 +636,10 @@ class ConeVec:
             shape: detector (rows, cols); default: the geometry's own.
 
         Returns:
-            (n, k, 2) pixel coordinates (column, row); pixel centres are integers. A point in the
-            plane of the source parallel to the detector gives inf or nan: it has no projection.
+            (n, k, 2) pixel coordinates (column, row); pixel centres are integers. A point
+            in the
+            plane of the source parallel to the detector gives inf or nan: it has no
+            projection.
 
         Example:
             >>> cone = ConeVec.from_vectors([0, -500, 0], [0, 500, 0], [0.5, 0, 0], [0, 0, -0.5])
@@ -663,8 +669,8 @@ class ConeVec:
         return np.stack([column, row], axis=-1)
 
     def piercing_points(self, shape: Shape2 | None = None) -> FloatArray:
-        """Compute the foot of the perpendicular from the focal spot, (n, 2) pixels
-        (column, row).
+        """Compute the foot of the perpendicular from the focal spot, (n, 2)
+        pixels (column, row).
 
         Example:
             >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
@@ -751,8 +757,8 @@ def check_shape(shape: Shape2) -> Shape2:
 
 
 def _stage_angles(angles: int | npt.ArrayLike, turns: float = 1.0) -> FloatArray:
-    """Return stage angles [deg]: given ones, or a number of them from 0 on, even over
-    whole turns.
+    """Return stage angles [deg]: given ones, or a number of them from 0 on, even
+    over full turns.
 
     Raises:
         GeometryError: no views, or an angle that is not finite.
@@ -777,7 +783,7 @@ def _numbers(
         value: one number or several.
         count: how many.
         unit: for the message.
-        repeated: whether one number stands for all.
+        repeated: whether one number is repeated.
     """
     array = np.asarray(value, dtype=np.float64)
     if array.ndim == 0 and (repeated or count == 1):
@@ -805,8 +811,8 @@ def check_spread(cone_vec: ConeVec) -> ConeVec:
     """Check that each pixel of each view has a ray of its own; returns its argument.
 
     Raises:
-        GeometryError: names the first row in which u or v is zero, u and v are parallel, or the
-            source lies in the detector's plane.
+        GeometryError: names the first row in which u or v is zero, u and v are parallel,
+            or the source is in the detector's plane.
 
     Example:
         >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
@@ -837,16 +843,16 @@ def check_spread(cone_vec: ConeVec) -> ConeVec:
 
 
 def check_cone_vec(cone_vec: ConeVec, pixel_mm: float | tuple[float, float]) -> ConeVec:
-    """Check the sanity rules of thesis 4.8.3; return the argument, so it can guard an
-    expression.
+    """Check the sanity rules of thesis 4.8.3; return the argument, so it can
+    guard an expression.
 
     Args:
         cone_vec: the geometry to check.
         pixel_mm: the binned pixel pitch that |u| and |v| must have [mm], or one for each.
 
     Raises:
-        GeometryError: names the first offending row, the check, the value and what is
-            allowed.
+        GeometryError: names the first offending row, the check, the value and the allowed
+            one.
 
     Example:
         >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)

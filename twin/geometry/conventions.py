@@ -1,25 +1,28 @@
 """The one statement of frames, signs and units; everything else converts at the edge.
 
-World frame, right-handed: +x to the right as seen from the source (traversal), +y from source to
-detector (magnification), +z up. Origin: the lowest central point of the source (thesis 4.3.1).
+World frame, right-handed: +x to the right as seen from the source (traversal), +y from
+source to detector (magnification), +z up. Origin: the lowest central point of the source
+(thesis 4.3.1).
 
-Object frame: centred on the rotation axis at the sample's reference height. It coincides with the
-world's directions at rot_obj = 0 and turns with the stage; growing rot_obj turns the object
-CLOCKWISE seen from above. cone_vec rows are always in this frame, so a turn by phi is ASTRA's
-`cone` angle +phi.
+Object frame: centred on the rotation axis at the sample's reference height. It coincides
+with the world's directions at rot_obj = 0 and turns with the stage; growing rot_obj turns
+the object CLOCKWISE seen from above. cone_vec rows are always in this frame, so a turn by
+phi is ASTRA's `cone` angle +phi.
 
-Detector: u = +x is the step to the next column, v = -z the step to the next row, so frame[0, 0] is
-the top left pixel seen from the source. The normal u x v is +y, away from the source. Integer
-pixel coordinates (column, row) are pixel centres, counted from (0, 0).
+Detector: u = +x is the step to the next column, v = -z the step to the next row, so
+frame[0, 0] is the top left pixel seen from the source. The normal u x v is +y, away from
+the source. Integer pixel coordinates (column, row) are pixel centres, counted from (0,
+0).
 
-Unity's frame of the thesis is left-handed with (x traversal, y vertical, z magnification); here
-that is (x, z, y), a swap without any sign change. The swap has determinant -1, which is exactly
-the change of handedness. The thesis's equation 4.1 has determinant +1 and does not change
-handedness (it mirrors the volume top to bottom unless that is stored upside down as well), so it
-is not used. Unity's R_y(a) of eq. 5.5 becomes R_z(-a): clockwise from above.
+Unity's frame of the thesis is left-handed with (x traversal, y vertical, z
+magnification); here that is (x, z, y), a swap without any sign change. The swap has
+determinant -1, which is exactly the change of handedness. The thesis's equation 4.1 has
+determinant +1 and does not change handedness (it mirrors the volume top to bottom unless
+that is stored upside down as well), so it is not used. Unity's R_y(a) of eq. 5.5 becomes
+R_z(-a): clockwise from above.
 
-Inside the package: mm, rad, s. Degrees, kV, W and ms appear only at the edges, with a suffix in
-the name. `T_a_b` takes coordinates in b to a.
+Inside the package: mm, rad, s. Degrees, kV, W and ms appear only at the edges, with a
+suffix in the name. `T_a_b` takes coordinates in b to a.
 """
 
 from __future__ import annotations
@@ -113,8 +116,8 @@ def rotation_z(angle: float | FloatArray) -> FloatArray:
 
 
 def rotation_about(axis: npt.ArrayLike, angle: float) -> FloatArray:
-    """Compute right-handed rotations (..., 3, 3) by `angle` [rad] about directions (...,
-    3) (Rodrigues).
+    """Compute right-handed rotations (..., 3, 3) by `angle` [rad] about directions
+    (..., 3) (Rodrigues).
 
     Example:
         >>> bool(np.allclose(rotation_about([0, 0, 2], 0.3), rotation_z(0.3)))
@@ -130,8 +133,8 @@ def rotation_about(axis: npt.ArrayLike, angle: float) -> FloatArray:
 
 
 def stage_rotation(angle: float | FloatArray) -> FloatArray:
-    """Compute T_world_object (rotation part) at stage angle `angle` [rad]: clockwise from
-    above.
+    """Compute T_world_object (rotation part) at stage angle `angle` [rad]:
+    clockwise from above.
 
     Example:
         >>> (stage_rotation(np.pi / 2) @ [1, 0, 0]).round(9).tolist()  # clockwise from above

@@ -1,7 +1,7 @@
 """Motion of scanner or sample during a scan: how frames differ from one another.
 
-It is put into `Poses`, so whatever takes one geometry a view takes it: formats, reconstruction.
-`calibration.fit.fitted_motion` finds it.
+It is put into `Poses`, so whatever takes one geometry a view takes it: formats,
+reconstruction. `calibration.fit.fitted_motion` finds it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def require_movable(names: Sequence[str]) -> Sequence[str]:
     """Check that named parameters may move.
 
     Raises:
-        UnknownNameError: says which can.
+        UnknownNameError: lists those that can.
     """
     for name in names:
         if name not in MOVABLE:
@@ -42,7 +42,8 @@ class Motion:
     Attributes:
         names: p parameters.
         values: (n, p) deviations, internal units (mm, rad).
-        sigma: (n, p) their standard deviations; nan where a parameter was found not to move.
+        sigma: (n, p) their standard deviations; nan where a parameter was found not to
+            move.
         evidence: (p,) gain in log likelihood by letting the parameter move.
     """
 
@@ -59,8 +60,8 @@ class Motion:
         return f"<Motion: {len(self.values)} frames, {sizes}>"
 
     def near(self, other: Motion) -> bool:
-        """Return whether two estimates of one motion differ by less than a hundredth of a
-        sigma."""
+        """Return whether two estimates of one motion differ by less than a
+        hundredth of a sigma."""
         apart = np.abs(self.values - other.values)
         return bool((apart <= 0.01 * np.nan_to_num(self.sigma)).all())
 
@@ -91,8 +92,8 @@ class Motion:
         )
 
     def to_dict(self) -> dict[str, dict[str, object]]:
-        """Convert to parameter -> {unit, values, sigmas, evidence, moves} in edge units
-        (mm, deg)."""
+        """Convert to parameter -> {unit, values, sigmas, evidence, moves} in edge
+        units (mm, deg)."""
         return {
             name: {
                 "unit": UNITS[name],

@@ -1,10 +1,10 @@
 """The seventeen geometric offsets of the thesis and their extension, as one frozen value.
 
-Each is true minus nominal and is added to nominal (`angle_scale` multiplies and is 1 when the
-angles are right). Names are the thesis's, in Unity's axes: x traversal, y vertical, z
-magnification. Internally they are in mm and rad; `from_edge` and `to_edge` convert from and to the
-mm and degrees of wire, files and command line. A hidden misalignment ("truth") and a calibration's
-correction have the same type.
+Each is true minus nominal and is added to nominal (`angle_scale` multiplies and is 1 when
+the angles are right). Names are the thesis's, in Unity's axes: x traversal, y vertical, z
+magnification. Internally they are in mm and rad; `from_edge` and `to_edge` convert from
+and to the mm and degrees of wire, files and command line. A hidden misalignment ("truth")
+and a calibration's correction have the same type.
 """
 
 from __future__ import annotations

@@ -1,12 +1,13 @@
-"""Distortion of the panel's picture: a low polynomial in the plane of the panel, and gaps between
-its tiles. And its lag: part of the light of the frame before.
+"""Distortion of the panel's picture: a low polynomial in the plane of the panel, and gaps
+between its tiles. And its lag: part of the light of the frame before.
 
-A place measured at m [px] belongs to the undistorted place m - d(m), d(m) = sum of coefficient
-times term. The terms are the polynomials of degree two and three in both directions, unequal pixel
-pitches and a skew; with a gap, everything beyond the border is shifted. Shifts, a scale and a turn
-of the whole are not among them: those are offsets of the scanner.
+A place measured at m [px] belongs to the undistorted place m - d(m), d(m) = sum of
+coefficient times term. The terms are the polynomials of degree two and three in both
+directions, unequal pixel pitches and a skew; with a gap, everything beyond the border is
+shifted. Shifts, a scale and a rotation of the image are not among them: those are offsets
+of the scanner.
 
-Terms of degree two look much like a tilted panel. What tells them apart is their prior: each
+Terms of degree two look much like a tilted panel. Their prior distinguishes them: each
 coefficient is about as large as the data show the others to be. It enters every sigma.
 """
 
@@ -79,8 +80,8 @@ class PanelModel:
         return out
 
     def terms(self, places: FloatArray) -> FloatArray:
-        """Compute shifts (..., 2, m) for a coefficient of 1 at places (..., 2), pixels
-        (column, row)."""
+        """Compute shifts (..., 2, m) for a coefficient of 1 at places (..., 2),
+        pixels (column, row)."""
         rows, cols = self.shape
         middle = np.array([cols - 1, rows - 1]) / 2
         half = max(rows, cols) / 2
@@ -98,7 +99,7 @@ class PanelModel:
 
 @dataclass(frozen=True)
 class Panel:
-    """A distortion, and what the panel still shows of the image before.
+    """A distortion, and the remaining light of the image before.
 
     Attributes:
         model: its terms.
@@ -124,14 +125,14 @@ class Panel:
 
     @cached_property
     def _map(self) -> tuple[Float32Array, Float32Array]:
-        """Columns and rows of the panel, (rows, cols) both, to which undistorted pixels
-        belong."""
+        """Columns and rows of the panel, (rows, cols) both, to which
+        undistorted pixels belong."""
         rows, cols = self.model.shape
         places = np.moveaxis(np.mgrid[:rows, :cols][::-1], 0, -1).astype(np.float64)
         out = places
         for _ in range(4):  # A distortion is smooth: each time, little is left of the error.
             out = places + self.shift(out)
-        for border in self.model.borders:  # What lies in a gap is between the lines beside it.
+        for border in self.model.borders:  # A pixel in a gap is between the lines beside it.
             axis = border.axis
             first = math.ceil(border.at)
             sides = np.stack([places[:, :1] if axis == 0 else places[:1]] * 2)

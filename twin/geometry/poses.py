@@ -1,9 +1,9 @@
 """Positions of source, rotation axis and detector, and the cone_vec that follows from them.
 
-`Poses` is the nominal geometry of n frames in the world frame. `Poses.cone_vec(offsets)` applies
-offsets to it: the true geometry (hidden misalignment), the corrected one and the model that
-calibration fits all come from it, so they cannot disagree about a sign. `machine.kinematics` makes
-poses from motor positions.
+`Poses` is the nominal geometry of n frames in the world frame. `Poses.cone_vec(offsets)`
+applies offsets to it: the true geometry (hidden misalignment), the corrected one and the
+model that calibration fits all come from it, so they cannot disagree about a sign.
+`machine.kinematics` makes poses from motor positions.
 """
 
 from __future__ import annotations
@@ -39,8 +39,10 @@ class Poses:
         detector: centre of the region of interest, (n, 3) [mm].
         u: step to the next column, (n, 3) [mm].
         v: step to the next row, (n, 3) [mm].
-        angle: accumulated stage angle, (n,) [rad]; growing turns the object clockwise from above.
-        mount: where a stage on the turntable holds the sample, (n, 3) [mm]; it turns with it.
+        angle: accumulated stage angle, (n,) [rad]; growing turns the object clockwise
+            from above.
+        mount: where a stage on the turntable holds the sample, (n, 3) [mm]; it turns with
+            it.
     """
 
     source: FloatArray
@@ -115,10 +117,10 @@ class Poses:
         """Make world poses whose nominal cone_vec is this one, to 1e-12 of its size.
 
         The stage angle of a view is the direction of u seen from above, unwrapped in
-        frame order (no step is larger than half a turn), so what is at rest in the world
-        stays at rest here and correction parameters keep their meaning. A panel turned by
-        det_yaw is taken for a turn of the sample, which only shifts alpha. The axis is
-        the object frame's z.
+        frame order (no step is larger than half a turn), so an object at rest in the
+        world stays at rest here and correction parameters keep their meaning. A panel
+        turned by det_yaw is taken for a turn of the sample, which only shifts alpha. The
+        axis is the object frame's z.
 
         Raises:
             GeometryError: u has no horizontal part in some view; names the first.
@@ -152,7 +154,7 @@ class Poses:
     def cone_vec(self, parameters: Offsets = NOMINAL) -> ConeVec:
         """Compute the geometry in the object's frame, with `parameters` added to nominal.
 
-        A point b of the phantom stands in the world at q = c + T R(alpha + angle_scale *
+        A point b of the phantom is in the world at q = c + T R(alpha + angle_scale *
         angle) (b + mount - tau), c = O + dO + tau, with R clockwise from above and T the
         axis tilt (axis_tilt_x about world +x, then axis_tilt_z about world +y, pivot c,
         assumed): thesis eq. 5.4 for T = 1. The rows are the world geometry under the

@@ -1,7 +1,7 @@
 """Rays that run through: a panel before or inside an object is virtual, and cuts no ray.
 
-Line integrals are those of whole rays, from the focal spot to infinity, as other programs have
-them: their samples often put the panel at the rotation axis, with pixels as small as there.
+Line integrals are those of infinite rays from the focal spot, as in other programs: their
+samples often put the panel at the rotation axis, with pixels as small as there.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ MOVED_BEHIND: Final = 1.001
 
 
 def stretches(cone_vec: ConeVec, points: FloatArray) -> FloatArray:
-    """Find how many times further from the source a panel must stand to be behind an object.
+    """Compute the factor on each panel's distance from the source that puts it
+    behind an object.
 
     Args:
         cone_vec: n views.
@@ -57,8 +58,8 @@ def run_through(cone_vec: ConeVec, points: FloatArray) -> ConeVec:
 
 
 def stretched(cone_vec: ConeVec, times: FloatArray) -> ConeVec:
-    """Move panels to `times` (n,) their distance from the source, with pixels enlarged
-    alike."""
+    """Move panels to `times` (n,) their distance from the source, with
+    pixels enlarged alike."""
     moved = times != 1.0
     if not moved.any():
         return cone_vec
@@ -68,8 +69,8 @@ def stretched(cone_vec: ConeVec, times: FloatArray) -> ConeVec:
 
 
 def stretched_steps(rows: FloatArray, times: FloatArray) -> FloatArray:
-    """Stretch rows (n, 12), or changes of them, to panels `times` (n,) as far from the
-    source."""
+    """Stretch rows (n, 12), or changes of them, to panels `times` (n,) as far
+    from the source."""
     out = rows.copy()
     many = times[:, None]
     out[:, 3:6] = rows[:, :3] + many * (rows[:, 3:6] - rows[:, :3])
@@ -78,8 +79,8 @@ def stretched_steps(rows: FloatArray, times: FloatArray) -> FloatArray:
 
 
 def relaxed_gradient(gradient: FloatArray, times: FloatArray) -> FloatArray:
-    """Convert derivatives (n, 12) by the rows of `stretched_steps` to those by the
-    original rows."""
+    """Convert derivatives (n, 12) by the rows of `stretched_steps` to those by
+    the original rows."""
     out = gradient.copy()
     many = times[:, None]
     out[:, :3] = gradient[:, :3] + (1.0 - many) * gradient[:, 3:6]

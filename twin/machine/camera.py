@@ -1,8 +1,8 @@
-"""Camera settings and what follows from them: binning, region of interest, image size, pitch.
+"""Camera settings and derived values: binning, region of interest, image size, pitch.
 
-Image size is always derived from mode and ROI, never a constant. ROI is (left, top, right,
-bottom): inclusive, in unbinned pixels, origin top left (checked, flexray.md). Counts and noise are
-in `physics.exposure`.
+Image size is always derived from mode and ROI, never a constant. ROI is (left, top,
+right, bottom): inclusive, in unbinned pixels, origin top left (checked, flexray.md).
+Counts and noise are in `physics.exposure`.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class PixelGrid:
 class CameraSettings:
     """Settings of the camera; `frames` and `averages` are counts, exposure is in ms.
 
-    `modes` are the detector's modes whose names do not tell their binning: (name,
+    `modes` are the detector's modes whose names do not contain their binning: (name,
     binning).
     """
 
@@ -169,10 +169,10 @@ def without_number(mode: str) -> str:
 
 
 def check_roi(roi: Roi, grid: PixelGrid, binning: int) -> Roi:
-    """Check that `roi` lies on the sensor and holds at least one binned pixel; return it.
+    """Check that `roi` is on the sensor and holds at least one binned pixel; return it.
 
     Raises:
-        LimitError: says which edge, its value and what is allowed.
+        LimitError: names the edge, its value and the allowed ones.
     """
     for name, value in vars(roi).items():
         sides = name in ("left", "right")

@@ -1,9 +1,9 @@
 """The scanner as data: a validated description from TOML, so another scanner is another file.
 
-It holds axes with limits, speeds and accelerations, the couplings between them, the components and
-their parents, detector, tube, timing, and the calibration profiles (zero offsets by date). A file
-may begin with a machine that ships and say only what is different. An error names file, key path,
-value and what is allowed.
+It holds axes with limits, speeds and accelerations, the couplings between them, the
+components and their parents, detector, tube, timing, and the calibration profiles (zero
+offsets by date). A file may begin with a machine that ships and contain only the
+differences. An error names file, key path, value and allowed values.
 """
 
 from __future__ import annotations
@@ -81,10 +81,10 @@ _CONTAINED_PLACES: Final = {
     "sample_mount": "the rotation axis, which is its x = y = 0",
     "panel": "the active area, whose centre is its 0, 0, 0",
 }
-"""Role of a component -> what its body must contain, for error messages."""
+"""Role of a component -> place that its body must contain, for error messages."""
 Corners = Callable[[str], Sequence[Vector3]]
-"""Reads a mesh file by the name that a machine file gives it: corners of a convex body around the
-mesh [mm, its own frame], at most `MAX_POINTS`."""
+"""Reads a mesh file by the name that a machine file gives it: corners of a convex body
+around the mesh [mm, its own frame], at most `MAX_POINTS`."""
 Raw = dict[str, Any]
 _ONE_DETECTOR: Final = "a machine has one tube and one flat panel, [tube] and [detector]"
 _KEY_LIMITS: Final = {
@@ -96,7 +96,7 @@ _KEY_LIMITS: Final = {
     "unit": 'linear axes are in mm, axes with kind = "rotation" in deg',
     "kind": "axes slide or turn about the vertical; what tilts is not modelled",
 }
-"""Key of a machine file -> what docs/limits.md says of it, for error messages."""
+"""Key of a machine file -> limitation by docs/limits.md, for error messages."""
 
 
 def _one_word(name: str) -> str:
@@ -177,8 +177,9 @@ class VirtualAxis(_Frozen):
 
 
 class DetectorSpec(_Frozen):
-    """The table `[detector]` of a machine file: what of the flat panel is the machine's own, and
-    the camera settings in force at start. `physics.detector_of` makes the detector of it."""
+    """The table `[detector]` of a machine file: the machine's own figures of the flat
+    panel, and the camera settings in force at start. `physics.detector_of` makes the
+    detector of it."""
 
     model: str
     shape: Literal["flat"] = "flat"
@@ -194,7 +195,8 @@ class DetectorSpec(_Frozen):
     modes: dict[str, Binning] = Field(default_factory=dict)
     """Binning of the camera modes whose names are not HWaSWb{High,Low}."""
     hardware_binning: tuple[Binning, ...] = (1, 2, 4)
-    """Factors a of the modes HWaSWb{High,Low}; the default is the Dexela 1512NDT's (data sheet)."""
+    """Factors a of the modes HWaSWb{High,Low}; the default is the Dexela
+    1512NDT's (data sheet)."""
     software_binning: tuple[Binning, ...] = (1, 2, 4)
     """Factors b (default assumed)."""
     gains: tuple[Literal["High", "Low"], ...] = ("High", "Low")
@@ -209,8 +211,9 @@ class DetectorSpec(_Frozen):
     long_lag_s: Positive = 10.0
     """Time constant with which they give it back."""
     response: tuple[tuple[Positive, Annotated[float, Field(ge=0)]], ...] = ()
-    """Measured: photon energy and the energy that a photon leaves on average [keV]; straight
-    between the points, and from the first one to nothing at 0. None: computed for CsI."""
+    """Measured: photon energy and the energy that a photon leaves on average [keV];
+    straight between the points, and from the first one to nothing at 0. None:
+    computed for CsI."""
 
     @property
     def pixels(self) -> PixelGrid:
@@ -291,20 +294,21 @@ class TubeSpec(_Frozen):
     kV: Positive
     power_W: Positive
     cold_after_s: float = Field(28_800.0, ge=0)
-    """Off for longer than this, the tube warms up when it is next switched on (assumed: 8 h)."""
+    """Off for longer than this, the tube warms up when it is next switched on
+    (assumed: 8 h)."""
     warm_up_s: float = Field(300.0, ge=0)
-    """How long that takes [s] (assumed: makers of microfocus tubes ask for some minutes)."""
+    """How long that takes [s] (assumed: makers of microfocus tubes require some minutes)."""
     filters: tuple[FilterSpec, ...] = Field(
         default_factory=lambda: (FilterSpec.model_construct(material="Al@2.70", thickness_mm=0.5),)
     )
-    """What the whole beam goes through (assumed: stands for window and inherent filtration)."""
+    """Layers in the path of the beam (assumed: instead of window and inherent filtration)."""
     spot_mm_per_W: float = Field(0.001, ge=0, le=1)
     """Focal spot a watt, full width at half maximum (assumed: usual for microfocus tubes)."""
     smallest_spot_mm: float = Field(0.007, ge=0, le=10)
     """Focal spot at little power (assumed)."""
     spot_points: int = Field(1, ge=1, le=1024)
-    """Of the focal spot, from which rays start: each depth of the sample has its own blur. With 1
-    all of it is blurred as the rotation axis is."""
+    """Of the focal spot, from which rays start: each depth of the sample has its own
+    blur. With 1 all of it is blurred as the rotation axis is."""
 
     @model_validator(mode="after")
     def _starts_within(self) -> TubeSpec:
@@ -326,10 +330,11 @@ def _box_around(points: Iterable[Vector3]) -> tuple[Vector3, Vector3]:
 class Component(_Frozen):
     """A convex part of the machine on its kinematic chain; upright in world axes, mm.
 
-    A part moves with its own motor and with those of its parents. `center_mm` is its centre with
-    every quantity of `geometry` at zero; along the directions in which its chain moves it, or in
-    which `fixed` says where its anchor stands, it is therefore measured from the focal spot, the
-    rotation axis or the panel's centre (see `anchor`), along the others from the world's origin.
+    A part moves with its own motor and with those of its parents. `center_mm` is its
+    centre with every quantity of `geometry` at zero; along the directions in which its
+    chain moves it, or in which `fixed` has its anchor's place, it is therefore measured
+    from the focal spot, the rotation axis or the panel's centre (see `anchor`), along the
+    others from the world's origin.
     """
 
     name: Name
@@ -337,25 +342,26 @@ class Component(_Frozen):
     axis: str | None = None
     """The motor that moves this part relative to its parent (None: rigidly mounted)."""
     shape: Literal["box", "cylinder", "hull"] = "box"
-    """`cylinder` stands upright: size x is its diameter (y the same), z its height. `hull` is the
-    convex hull of `points_mm`, for parts with a mesh."""
+    """`cylinder` is upright: size x is its diameter (y the same), z its height. `hull` is
+    the convex hull of `points_mm`, for parts with a mesh."""
     mesh: str = ""
     """A GLB or STL file beside the machine file: how the part looks. `points_mm` contain it."""
     mesh_at_mm: Vector3 = (0.0, 0.0, 0.0)
-    """Where the mesh's origin stands, measured as `center_mm` is."""
+    """Place of the mesh's origin, measured as `center_mm` is."""
     points_mm: tuple[Vector3, ...] = Field((), max_length=MAX_POINTS)
     size_mm: tuple[Positive, Positive, Positive]
     center_mm: Vector3
     anchor: Literal["world", "source", "object", "detector"] = "world"
     """Whose quantities of `geometry` (and zero offsets) the motors of its chain move."""
     role: Literal["", "sample_holder", "sample_mount", "panel", "tube"] = ""
-    """What stands for the focal spot (`tube`), the active area (`panel`) or carries the sample."""
+    """Function of the part: focal spot (`tube`), active area (`panel`), or carrier
+    of the sample."""
     source: str = ""
 
     @field_validator("parent", "axis", mode="before")
     @classmethod
     def _none(cls, name: object) -> object:
-        """Convert "", which removes what the base has, to None: TOML has no null."""
+        """Convert "", which removes the base's value, to None: TOML has no null."""
         return None if name == "" else name
 
     @model_validator(mode="after")
@@ -371,7 +377,8 @@ class Component(_Frozen):
 
 
 class Spread(_Frozen):
-    """How a measured time varies [s]: nine of ten lie between `p5_s` and `p95_s`, from n times."""
+    """How a measured time varies [s]: nine of ten are between `p5_s` and `p95_s`,
+    from n times."""
 
     p5_s: float = Field(ge=0)
     p95_s: float = Field(ge=0, le=MAX_TIME_S)
@@ -403,13 +410,13 @@ class Timing(_Frozen):
     """None: as for one image."""
     write_settings_s: float = Field(0.0, ge=0)
     move_s: float = Field(0.0, ge=0)
-    """What the script waits for a move beyond its motion."""
+    """Wait of the script for a move beyond its motion."""
     move_standing_s: float = Field(0.0, ge=0)
-    """The same where the axis stands at its target already."""
+    """The same for an axis that is at its target already."""
     command_s: float = Field(0.0, ge=0)
     """Of all other commands, such as a pause beyond its length."""
     drift: float = Field(0.0, ge=0)
-    """By what part of themselves all times together may be longer or shorter in the next scan."""
+    """Relative change of all times together that is possible in the next scan."""
     spread: dict[str, Spread] = Field(default_factory=dict)
 
     @property
@@ -445,11 +452,11 @@ class Timing(_Frozen):
 
 
 class EStop(_Frozen):
-    """What an E-stop does to the motors: the stop categories of IEC 60204-1."""
+    """Effect of an E-stop on the motors: the stop categories of IEC 60204-1."""
 
     category: Literal[0, 1] = 1
-    """1: brake along the path with all that the motors can, then power off. 0: power off at once,
-    and the motors coast."""
+    """1: brake along the path with all that the motors can, then power off. 0: power off
+    at once, and the motors coast."""
     coasting: dict[str, Positive] = Field(default_factory=dict)
     """Motor -> deceleration without power [mm/s2, deg/s2]; every motor's, for category 0."""
 
@@ -463,12 +470,14 @@ def _known_offsets(priors: dict[str, float]) -> dict[str, float]:
 
 
 Priors = Annotated[dict[str, Annotated[float, Field(ge=0)]], AfterValidator(_known_offsets)]
-"""Offset -> standard deviation of what calibration need not be told [mm, deg; 1 for angle_scale];
-0 is exactly known, and what is left out is as `flexdt.twin.calibration.fit.priors` assumes."""
+"""Offset -> standard deviation of the knowledge before a calibration
+[mm, deg; 1 for angle_scale]; 0 is exactly known, and those left out are
+as `flexdt.twin.calibration.fit.priors` assumes."""
 
 
 class Profile(_Frozen):
-    """Dated zero offsets from motor readings to geometry [mm, deg]; never edited, only added."""
+    """Dated zero offsets from motor readings to geometry [mm, deg]; never
+    edited, only added."""
 
     name: str
     machine: str
@@ -481,11 +490,12 @@ class Profile(_Frozen):
     c_det: float = 0.0
     det_roll_deg: float = 0.0
     priors: Priors = Field(default_factory=dict)
-    """Standard deviations of what these offsets leave, where they differ from the machine's."""
+    """Standard deviations that remain with these offsets, where they differ
+    from the machine's."""
 
 
 class Machine(_Frozen):
-    """A whole scanner."""
+    """The description of a scanner."""
 
     schema_version: Literal[1] = Field(alias="schema")
     name: Name
@@ -509,7 +519,7 @@ class Machine(_Frozen):
     geometry: dict[str, dict[str, Factor]]
     """Quantity -> motor -> factor: each of QUANTITIES is a linear sum of motors."""
     fixed: dict[str, Length] = Field(default_factory=dict)
-    """Quantity -> its constant part [mm, deg]: where it stands, if no motor moves it."""
+    """Quantity -> its constant part [mm, deg]: its place, if no motor moves it."""
     timing: Timing
     priors: Priors = Field(default_factory=dict)
     """How well the offsets of this scanner are known before a calibration."""
@@ -529,11 +539,11 @@ class Machine(_Frozen):
 
     @model_validator(mode="after")
     def _consistent(self) -> Machine:
-        """Check what single tables cannot: names, kinds of axes, chains, roles, E-stop,
-        contacts.
+        """Check the relations between tables: names, kinds of axes, chains,
+        roles, E-stop, contacts.
 
         Raises:
-            PydanticCustomError: names the key, its value and what is allowed.
+            PydanticCustomError: names the key, its value and the allowed ones.
         """
         _require(self.geometry, QUANTITIES, "geometry", "quantity", f"; {NOT_MODELLED}")
         slides = [quantity for quantity in QUANTITIES if quantity != "angle"]
@@ -622,7 +632,7 @@ class Machine(_Frozen):
         """Check that focal spot, active area and holder are where the X-ray geometry has them.
 
         Otherwise a motor of `geometry` would move the image and leave the body behind,
-        and what collides would be called free.
+        and a collision would count as free.
         """
         across, up = self.detector.pixels.size_mm
         for role, anchor, half in (
@@ -668,7 +678,7 @@ class Machine(_Frozen):
         return [motor for q in quantities for motor in self.geometry.get(q, {})]
 
     def chain(self, component: Component) -> tuple[str, ...]:
-        """List the motors that carry `component`, from itself up to what does not move."""
+        """List the motors that carry `component`, from itself up to the fixed parts."""
         parents = {c.name: c for c in self.components}
         motors: list[str] = []
         part: Component | None = component
@@ -728,12 +738,7 @@ def parse_machine(text: str, file: str = "<machine>", corners: Corners | None = 
     `base = NAME` at the top of the text inherits everything else from a machine that
     ships, except its zero offsets and the axes and components that `without` lists.
     Tables are merged key by key and components by their names; a quantity of `geometry`
-    and `timing` are replaced as a whole.
-
-    `base = NAME` at the top of the text takes over all that it does not say from a
-    machine that ships, but for its zero offsets and for the axes and components that
-    `without` lists. Tables are merged key by key and components by their names; a
-    quantity of `geometry` and `timing` are replaced whole.
+    and `timing` are replaced entirely.
 
     Args:
         text: TOML.
@@ -742,7 +747,8 @@ def parse_machine(text: str, file: str = "<machine>", corners: Corners | None = 
             those beside the file).
 
     Raises:
-        MachineFileError: TOML or content does not hold; file, key path, value, allowed.
+        MachineFileError: TOML or content is invalid; file, key path, value, allowed
+            values.
     """
     machine = _parse(Machine, lambda own: _inherited(_meshed(own, corners)), text, file)
     driving = {name for factors in machine.geometry.values() for name in factors}
@@ -853,7 +859,7 @@ def _meshed(own: Raw, corners: Corners | None) -> Raw:
         corners: reads the corners of a mesh file.
 
     Raises:
-        UnknownNameError: names the component and what is wrong with it.
+        UnknownNameError: names the component and its problem.
     """
     parts = own.get("components", [])
     meshed = [p for p in parts if isinstance(p, dict) and "mesh" in p] if parts else []
@@ -1011,7 +1017,7 @@ def _parse(model: type[_M], prepared: Callable[[Raw], Raw], text: str, file: str
 
 
 def _limit(path: str) -> str:
-    """Return what docs/limits.md says of a key, to end an error with, or ""."""
+    """Return the limitation by docs/limits.md of a key, to end an error with, or ""."""
     last = path.rpartition(".")[2].lower()
     said = next((text for key, text in _KEY_LIMITS.items() if last.startswith(key)), None)
     if said:

@@ -1,4 +1,5 @@
-"""A machine file with the axes and times of a fit, everything else as in the file it began with."""
+"""A machine file with the axes and times of a fit, everything else as in the file
+it began with."""
 
 from __future__ import annotations
 
@@ -45,7 +46,7 @@ def fitted_text(
 
 
 def _replaced(text: str, blocks: Mapping[str, str]) -> str:
-    """Replace whole tables of `text`; a comment stays unless it is right before one."""
+    """Replace tables of `text`; a comment stays unless it is right before one."""
     left = dict(blocks)
     out: list[str] = []
     held: list[str] = []

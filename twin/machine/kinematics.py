@@ -1,10 +1,11 @@
 """Motor positions to nominal poses: the machine's linear map, the profile's offsets, the ROI.
 
-quantity = sum(factor * motor) + offset, then `Poses`. Positions are in the script's sign and unit
-(mm, deg), one number or an array per motor. Corrections are applied later, by `Poses.cone_vec`.
+quantity = sum(factor * motor) + offset, then `Poses`. Positions are in the script's sign
+and unit (mm, deg), one number or an array per motor. Corrections are applied later, by
+`Poses.cone_vec`.
 
-`place` says where a machine's motors put source, sample and detector: what a distance is the sum
-of.
+`place` describes where a machine's motors put source, sample and detector: the terms of a
+distance.
 """
 
 from __future__ import annotations
@@ -75,8 +76,8 @@ def motor_poses(
     Args:
         machine: whose motors these are.
         profile: zero offsets in force.
-        camera: decides pixel pitch and where the image's centre lies on the sensor.
-        positions: motor -> scalar or (n,) [mm, deg]; motors left out stand at home.
+        camera: decides pixel pitch and the place of the image's centre on the sensor.
+        positions: motor -> scalar or (n,) [mm, deg]; motors left out are at home.
 
     Returns:
         n poses (n = 1 if every position is a scalar).
@@ -141,13 +142,14 @@ def resolve_targets(
 
     `twin/machine/travel.py` has the rule for targets beyond a limit.
 
-    `twin/machine/travel.py` has the rule for what lies beyond a limit.
-
     Args:
         machine: whose axes these are.
         targets: axis -> value [mm, deg], absolute, or a displacement when `relative`.
-        positions: where the motors stand (or are already bound for).
+        positions: where the motors are (or their present targets).
         relative: read `targets` as displacements.
+
+    Returns:
+        Motor -> target [mm, deg].
 
     Raises:
         UnknownNameError: no such axis.
@@ -234,7 +236,7 @@ class Place:
 
     Attributes:
         name: in words.
-        total: what it is the sum of, such as "900 + D".
+        total: its terms, such as "900 + D".
         least, most, home: its ends over the travel of its motors, and at home [mm, deg].
     """
 

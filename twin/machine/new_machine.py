@@ -24,7 +24,7 @@ _RAIL_VALUES: dict[str, object] = {
 
 @dataclass(frozen=True)
 class Answers:
-    """What is different from the base; None is as there.
+    """Differences from the base; None is as there.
 
     Attributes:
         name: of the machine; one word.
@@ -33,8 +33,8 @@ class Answers:
         columns, rows: of the panel, unbinned.
         pitch_mm: from column to column and from row to row.
         bits: of a pixel.
-        sod_mm, sdd_mm: source-object and source-detector distance: one if it is fixed, else from
-            the least to the greatest.
+        sod_mm, sdd_mm: source-object and source-detector distance: one if it is fixed,
+            else from the least to the greatest.
         min_kV, max_kV, max_W: of the tube.
         limits: axis -> travel [mm, deg].
         without: axes and components that there are not.
@@ -63,8 +63,8 @@ def new_machine_text(answers: Answers) -> str:
         UnknownNameError: no such base, or it has no such axis.
         LimitError: a range of SOD for a base without a motor along it; SOD or SDD and the
             travel of its motor.
-        MachineFileError: the answers do not make a machine; key, value and what is
-            allowed.
+        MachineFileError: the answers do not make a machine; key, value and allowed
+            values.
 
     Example:
         >>> text = new_machine_text(Answers("lab", "micro_ct", sod_mm=(80.0, 80.0), max_kV=90.0))
@@ -98,7 +98,7 @@ def new_machine_text(answers: Answers) -> str:
             ends = sorted((d - base.fixed.get(quantity, 0.0)) / factor for d in distance)
             limits[motor] = (ends[0], ends[1])
         elif quantity == "detector_y" and panel is not None and panel.axis is None:
-            # A cabinet whose panel runs on a rail: what stood fixed is a motor's reading now.
+            # A cabinet whose panel runs on a rail: the fixed distance is a motor's reading now.
             fixed[quantity] = 0.0
             home = min(max(base.fixed.get(quantity, 0.0), distance[0]), distance[1])
             rail = {"lower": distance[0], "upper": distance[1], "home": home, **_RAIL_VALUES}

@@ -1,10 +1,11 @@
-"""One rule for what lies beyond a motor's limit, whatever door a command comes through.
+"""One rule for targets beyond a motor's limit, for every kind of command.
 
-A target beyond the travel by rounding alone is the limit. One beyond it by no more than the axis's
-`arrival_tolerance` (the thesis's arrivalThreshold) arrives at the limit, and this is told. For what
-lies farther beyond, the machine's `on_limit` says whether a line of a script goes to the limit, as
-at a limit switch, or is an error; a request by itself is refused, since its sender can be told.
-Motors of a virtual axis give up the same share.
+A target beyond the travel by rounding alone is the limit. One beyond it by no more than
+the axis's `arrival_tolerance` (the thesis's arrivalThreshold) arrives at the limit, with
+a message. For one farther beyond, the machine's `on_limit` decides whether a line of a
+script goes to the limit, as at a limit switch, or is an error; a single request is
+rejected, since its sender gets the error. Motors of a virtual axis give up the same
+share.
 
 Rates have no tolerance, and otherwise the same rule.
 """
@@ -55,7 +56,7 @@ def arrival(machine: Machine, axis: str, targets: Mapping[str, float]) -> Arriva
     Args:
         machine: whose motors these are.
         axis: motor or virtual axis that is moved.
-        targets: motor -> target as asked [mm, deg].
+        targets: motor -> requested target [mm, deg].
     """
     told = []
     beyond = None
@@ -71,8 +72,8 @@ def arrival(machine: Machine, axis: str, targets: Mapping[str, float]) -> Arriva
 
 
 def rate(machine: Machine, axis: str, what: Rate, value: float) -> Arrival:
-    """Apply the rule to a speed or acceleration of `axis` that may be above its motors'
-    maximum.
+    """Apply the rule to a speed or acceleration of `axis` that may be above
+    its motors' maximum.
 
     Args:
         machine: whose motors these are.
@@ -102,7 +103,7 @@ def check_target(machine: Machine, axis: str, value: float) -> float:
         The value; the limit, if it is beyond that by rounding alone.
 
     Raises:
-        LimitError: says axis, value, unit and limits.
+        LimitError: names axis, value, unit and limits.
     """
     a = machine.axis(axis)
     if not _distance_beyond(machine, axis, value) <= POSITION_ROUNDING:

@@ -1,9 +1,10 @@
 """How motors come to rest: along the path they are on together, or each motor by itself.
 
-A programme of several motors is free only as a whole: a motor that brakes by itself while another
-drives on leaves the path that was swept. `braked_along` therefore slows the programme's own time,
-p(s(t)) with ds/dt from 1 down to 0, so that every position passed was swept before. `braked_apart`
-stops every motor as soon as that motor can; it leaves the path and has to be swept.
+A programme of several motors is free only as a whole: a motor that brakes by itself while
+another drives on leaves the path that was swept. `braked_along` therefore slows the
+programme's own time, p(s(t)) with ds/dt from 1 down to 0, so that every position passed
+was swept before. `braked_apart` stops every motor as soon as that motor can; it leaves
+the path and has to be swept.
 """
 
 from __future__ import annotations
@@ -21,12 +22,10 @@ from flexdt.twin.motion.profiles import TIME_ROUNDING_S, Piece, Trajectory
 PATH_TOLERANCE = 1e-5
 """Largest distance of the pieces of constant acceleration from the slowed path [mm, deg].
 
-A thousandth of the tolerance of a sweep, so that what was swept stays certified.
-
-A thousandth of the tolerance of a sweep, so that what was swept stays certified.
+A thousandth of the tolerance of a sweep, so that a swept path stays certified.
 """
 MIN_TIME_RATE = 1e-9
-"""Rate of programme time below which it stands still."""
+"""Rate of programme time below which it counts as stopped."""
 VELOCITY_ROUNDING = 1e-6
 """Velocity that counts as rounding [mm/s, deg/s]."""
 MIN_CELL_S = 1e-7
@@ -92,7 +91,7 @@ def braked_apart(
     """Stop every motor as soon as it can; motors of one virtual axis stay in step.
 
     Args:
-        machine: says which motors belong together.
+        machine: defines which motors belong together.
         drives: every motor with all that it is to follow.
         now: from when on [s].
         most: as for `braked_along`.
@@ -188,8 +187,8 @@ def _coupled(machine: Machine, velocity: Mapping[str, float]) -> Iterable[list[s
 
 
 def greatest(name: str, leg: Trajectory, time: float, most: Most) -> float:
-    """Return the acceleration that a motor may brake with while it follows `leg` [mm/s2,
-    deg/s2]."""
+    """Return the acceleration that a motor may brake with while it follows
+    `leg` [mm/s2, deg/s2]."""
     planned = leg.acceleration(time)
     if most is None:
         return planned
@@ -223,8 +222,8 @@ def _cells(drives: Drives, now: float, most: Most) -> list[_Cell]:
             time = time + step
             continue
         roughly = min(state.slowing(rate, 0.0) for state in states)
-        # Where a motor accelerates, constant acceleration is an approximation over a short time;
-        # it strays by 3 |a| rate slowing length^3 / 324.
+        # Where a motor accelerates, constant acceleration is an approximation over a
+        # short time; it strays by 3 |a| rate slowing length^3 / 324.
         jerk = max(3.0 * abs(state.acceleration) * rate * roughly for state in states)
         if jerk > 0.0:
             longest = min((324.0 * PATH_TOLERANCE / jerk) ** (1.0 / 3.0), rate / roughly)
@@ -253,8 +252,8 @@ class _State:
     until: float
 
     def slowing(self, rate: float, ahead: float) -> float:
-        """Compute how much programme time may slow over the next `ahead` programme
-        seconds [1/s]."""
+        """Compute how much programme time may slow over the next `ahead`
+        programme seconds [1/s]."""
         speed = abs(self.velocity)
         a = abs(self.acceleration)
         if self.velocity * self.acceleration < 0.0:  # it brakes: both are greatest at the start

@@ -1,10 +1,12 @@
-"""Motion commands as functions of where every motor is: they return new drives and change nothing.
+"""Motion commands as functions of where every motor is: they return new drives
+and change nothing.
 
-A `Drive` is one motor: its speed and acceleration settings and the trajectories it follows. The
-functions plan moves (several motors at once, coupled virtual axes, retargets in flight) and jogs so
-that velocity is continuous and no motor ever passes its limits. A retarget never uses less
-acceleration than the motion in force was planned with, so a setting lowered in flight cannot carry
-a motor past its end. What stands in their way is in `joining`; how they come to rest, in `braking`.
+A `Drive` is one motor: its speed and acceleration settings and the trajectories it
+follows. The functions plan moves (several motors at once, coupled virtual axes, retargets
+in flight) and jogs so that velocity is continuous and no motor ever passes its limits. A
+retarget never uses less acceleration than the motion in force was planned with, so a
+setting lowered in flight cannot carry a motor past its end. Obstacles are the subject of
+`joining`; how they come to rest, in `braking`.
 """
 
 from __future__ import annotations
@@ -27,13 +29,13 @@ from flexdt.twin.motion.profiles import MIN_RATE, Trajectory
 class Drive:
     """One motor: settings [mm/s or deg/s, per s] and trajectories in the order of their starts.
 
-    The trajectory in force at a time is the last that has begun; several of them are a programme
-    (a scan plan) whose later ones begin where the earlier ones end.
+    The trajectory in force at a time is the last that has begun; several of them are a
+    programme (a scan plan) whose later ones begin where the earlier ones end.
 
     Attributes:
         speed, acceleration: of motions to come.
-        trajectories: on the programme's own clock; a programme may have 100 000 of them, which
-            take most of a second to shift.
+        trajectories: on the programme's own clock; a programme may have 100 000 of them,
+            which take most of a second to shift.
         origin: the time at which that clock shows 0 [s].
     """
 
@@ -70,8 +72,8 @@ class Drive:
         return {}
 
     def next_start(self, now: float) -> float:
-        """Return the start of the trajectory after the one in force [s]; inf if there is
-        none."""
+        """Return the start of the trajectory after the one in force [s]; inf if
+        there is none."""
         index = self._index(now) + 1
         if index < len(self._starts):
             return self._starts[index]
@@ -134,7 +136,7 @@ def plan_move(
 
     Raises:
         UnknownNameError: no such axis.
-        LimitError: a target outside its travel, or one motor asked twice.
+        LimitError: a target outside its travel, or two targets of one motor.
 
     Returns:
         Motor -> trajectory.
@@ -297,7 +299,8 @@ def _shortest(axis: Axis, position: float, target: float) -> float:
     if axis.kind != "rotation":
         return target
     turns = round((position - target) / 360.0)
-    # The nearest may lie past the travel's end: then the next one inwards is the shortest allowed.
+    # The nearest may be past the travel's end: then the next one inwards is the shortest
+    # allowed.
     candidates = [target + 360.0 * (turns + more) for more in (0, -1, 1)]
     allowed = [c for c in candidates if axis.lower <= c <= axis.upper]
     if allowed:

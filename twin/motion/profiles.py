@@ -1,10 +1,11 @@
 """Motion of one motor as a closed form of time: pieces of constant acceleration.
 
-A `Trajectory` gives position and velocity at any time; nothing is stepped. Builders make the
-trapezoidal profile of thesis 4.5.1 (triangular when short) from any state of motion, the stop with
-deceleration, and the jog. Arrival is exact: after the end the position is the target (the thesis's
-1 mm arrival threshold is a simulation artefact). Limits are checked by the callers. An `AxisPath`
-is the same as arrays: what sweeps and plans ask for many moments at once.
+A `Trajectory` gives position and velocity at any time; nothing is stepped. Builders make
+the trapezoidal profile of thesis 4.5.1 (triangular when short) from any state of motion,
+the stop with deceleration, and the jog. Arrival is exact: after the end the position is
+the target (the thesis's 1 mm arrival threshold is a simulation artefact). Limits are
+checked by the callers. An `AxisPath` is the same as arrays: for sweeps and plans, which
+evaluate many moments at once.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ class Piece:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """A motor's motion over all time; before the first piece it stands at its position.
+    """A motor's motion over all time; before the first piece it is at its position.
 
     Attributes:
         pieces: in time order, at least one.
@@ -125,7 +126,8 @@ class Trajectory:
         return velocity, a, until
 
     def acceleration(self, time: float) -> float:
-        """Return the largest acceleration after `time`, >= 0: what braking was planned with."""
+        """Return the largest acceleration after `time`, >= 0: the one that braking
+        was planned with."""
         if time >= self.end:
             return 0.0
         return max(
@@ -136,7 +138,7 @@ class Trajectory:
 
     @property
     def top_speed(self) -> float:
-        """Largest speed on the whole way, >= 0: a piece has it at one of its ends."""
+        """Largest speed of the motion, >= 0: a piece has it at one of its ends."""
         ends = zip(self.pieces, (*[p.start for p in self.pieces[1:]], self.end), strict=True)
         return max(
             max(abs(p.velocity), abs(p.velocity + p.acceleration * (stop - p.start)))
@@ -177,7 +179,7 @@ class AxisPath(ArrayValue):
     """One axis over time: constant acceleration from each of `times` on, (k,) arrays.
 
     Attributes:
-        times: starts of the pieces [s], in order; before the first it stands at `x[0]`.
+        times: starts of the pieces [s], in order; before the first it is at `x[0]`.
         x: positions then [mm, deg].
         v: velocities then, per s.
         a: accelerations from then on, per s^2.
@@ -225,7 +227,7 @@ class AxisPath(ArrayValue):
 
 
 def at_rest(position: float, time: float = 0.0) -> Trajectory:
-    """Make the trajectory of a motor that stands at `position`.
+    """Make the trajectory of a motor at rest at `position`.
 
     Example:
         >>> at_rest(5.0).position(100.0)
@@ -300,7 +302,7 @@ def jog(
 ) -> Trajectory:
     """Plan a run at velocity `wanted` (signed) for `lease` seconds, then braking to rest.
 
-    Where the lease is shorter than the ramp, the motor brakes from what it has reached by
+    If the lease is shorter than the ramp, the motor brakes from the velocity reached by
     then.
 
     Example:
@@ -425,7 +427,8 @@ def _first_root(a: float, b: float, c: float) -> float | None:
         return None
     discriminant = b * b - 4 * a * c
     if discriminant < 0:
-        # A parabola that only just touches (the end of a ramp at the target) may round below zero.
+        # A parabola that only just touches (the end of a ramp at the target) may round
+        # below zero.
         if discriminant < -1e-12 * b * b - 1e-24:
             return None
         discriminant = 0.0

@@ -1,4 +1,5 @@
-"""From path lengths to counts, as the scanner makes them: tube, materials, panel, image quality."""
+"""From path lengths to counts, as the scanner makes them: tube, materials,
+panel, image quality."""
 
 from flexdt.twin.physics.blur import FWHM, blurred, spot_blur_px
 from flexdt.twin.physics.chain import Chain, expected_signal, flux_of, weights_of

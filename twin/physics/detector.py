@@ -1,7 +1,8 @@
 """The flat panel: light, charge, noise, blur, fixed pattern and the converter, with provenance.
 
-A pixel collects electrons in proportion to the energy its scintillator absorbs. `Detector` holds
-the figures, and says of each default whether it is measured, from the literature or assumed.
+A pixel collects electrons in proportion to the energy its scintillator absorbs.
+`Detector` holds the figures, and labels each default as measured, from the literature or
+assumed.
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ CAMERA_MODE = "HW1SW1High"
 EXPOSURES_MS = 1e-6, 1e7
 """Shortest and longest exposure of one read-out [ms]."""
 USUAL_MS = 100.0
-"""Exposure of a `Detector` that states none, where no tube says how bright its images are [ms]."""
+"""Exposure of a `Detector` that states none, if no tube determines the brightness
+of its images [ms]."""
 _OPTIONAL_FIGURES = {"pixel_mm", "exposure_ms", "electrons_per_count", "dark_e_per_s"}
 _BOUNDS = {
     "pixel_mm": (1e-6, 100.0), "exposure_ms": EXPOSURES_MS, "averages": (1, 1_000_000),
@@ -54,43 +56,44 @@ _BOUNDS = {
 @public
 @dataclass(frozen=True, kw_only=True)
 class Detector:
-    """A flat panel with a scintillator, of any make; the defaults are the twin's, a Dexela 1512NDT
-    with CsI(Tl). What stands below each says where it comes from.
+    """A flat panel with a scintillator, of any make; the defaults are the twin's, a
+    Dexela 1512NDT with CsI(Tl). The text below each field has its origin.
 
-    How many pixels it has and how large they are is the geometry's to say in `simulate`.
+    The number and size of the pixels come from the geometry in `simulate`.
 
     Args:
-        pixel_mm: pitch of the pixels [mm]; None for the geometry's. Another pitch than the
-            geometry's is an error.
-        exposure_ms: of one read-out [ms]; None: `flexdt.simulate` chooses it so that the brightest
-            pixel of the open beam reaches 80 % of the largest count.
+        pixel_mm: pitch of the pixels [mm]; None for the geometry's. Another pitch than
+            the geometry's is an error.
+        exposure_ms: of one read-out [ms]; None: `flexdt.simulate` chooses it so that the
+            brightest pixel of the open beam reaches 80 % of the largest count.
         averages: read-outs averaged into an image.
         bits: depth, 1 to 16; counts end at 2^bits - 1.
-        electrons_per_count: conversion gain; a pixel saturates at 2^bits times that. None: so that
-            a pixel of 14 bits holds as much charge for its area as the twin's.
+        electrons_per_count: conversion gain; a pixel saturates at 2^bits times that.
+            None: so that a pixel of 14 bits holds as much charge for its area as the
+            twin's.
         electrons_per_keV: charge for each keV that the scintillator keeps.
         scintillator: FORMULA@DENSITY [g/cm3] without gaps, such as Gd2O2S@7.34.
         scintillator_mm: its thickness [mm]; packing: the part of it that is not gaps.
         swank: statistical factor of the light from one photon (1: always the same).
         read_noise_e: standard deviation of one read-out of an image pixel [electrons].
         offset_counts: level without charge [counts].
-        dark_e_per_s: charge of an unbinned pixel without X-rays [electrons/s]; None: as much for
-            its area as the twin's.
+        dark_e_per_s: charge of an unbinned pixel without X-rays [electrons/s]; None: as
+            much for its area as the twin's.
         blur_mm: standard deviation of the point spread in the scintillator [mm].
-        gain_sigma, offset_sigma_counts: fixed pattern of gain (relative) and offset [counts], each
-            unbinned pixel.
+        gain_sigma, offset_sigma_counts: fixed pattern of gain (relative) and offset
+            [counts], each unbinned pixel.
         dead_fraction: unbinned pixels that give nothing.
         serial: seed of the fixed pattern: another panel has another one.
         pixels: of the panel, unbinned; `simulate` takes the geometry's.
-        lag_fraction, lag_s: part of the charge left for later images of a scan on the scanner, and
-            how fast it fades [s]; `simulate` has none.
-        long_lag_fraction, long_lag_s: part of the charge that traps take from its own image there,
-            and the time constant with which they give it back [s].
-        response: measured: energy of a photon and what it leaves on average [keV], instead of what
-            is computed for the scintillator.
+        lag_fraction, lag_s: part of the charge left for later images of a scan on the
+            scanner, and how fast it fades [s]; `simulate` has none.
+        long_lag_fraction, long_lag_s: part of the charge that traps take from its own
+            image there, and the time constant with which they give it back [s].
+        response: measured: energy of a photon and what it leaves on average [keV],
+            instead of what is computed for the scintillator.
 
     Raises:
-        LimitError: a figure that no detector has; says what is allowed.
+        LimitError: a figure that no detector has; the message lists the allowed values.
         UnknownNameError: a scintillator of an element without a table.
 
     Example:
@@ -228,8 +231,8 @@ class Detector:
         return (1 << self.bits) - 1
 
     def blur_px(self, camera: CameraSettings) -> tuple[float, float]:
-        """Compute the standard deviation of the light's spread along and across the rows
-        [image pixels].
+        """Compute the standard deviation of the light's spread along and across the
+        rows [image pixels].
 
         Example:
             >>> panel = Detector(blur_mm=0.3, pixels=PixelGrid(4, 4, 0.1))
@@ -320,7 +323,7 @@ class Detector:
         part, square = deposited(Filter(layer, self.scintillator_mm))
         energy = tables().energy_keV
         if self.response:
-            # What one photon leaves is spread as computed, for want of another measurement.
+            # The spread of one photon's energy is the computed one, for want of a measurement.
             spread = square / part
             points = np.array([(0.0, 0.0), *self.response])
             part = np.interp(energy, *points.T) / energy
@@ -348,7 +351,8 @@ def detector_of(spec: DetectorSpec) -> Detector:
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """Fixed pattern of the image pixels: gain (mean 1), offset [counts], dead (True gives 0)."""
+    """Fixed pattern of the image pixels: gain (mean 1), offset [counts], dead
+    (True gives 0)."""
 
     gain: Float32Array
     offset: Float32Array

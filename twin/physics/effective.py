@@ -1,11 +1,12 @@
-"""A spectrum reduced to a few effective energies that transmit what the spectrum transmits.
+"""A spectrum reduced to a few effective energies with the same transmission.
 
-The transmission of a spectrum through any mixture of the sample's materials is a weighted sum of
-exponentials, one for each energy. Far fewer exponentials give the same sum over the thicknesses
-that occur: energies are taken one by one where they help most, with non-negative weights, until the
-largest relative error on a set of thicknesses is below the tolerance. Then many more thicknesses
-are drawn; those that miss the tolerance join the set, and the fit is repeated. The result holds the
-tolerance on thicknesses that had no part in the choice; otherwise there is an error.
+The transmission of a spectrum through any mixture of the sample's materials is a weighted
+sum of exponentials, one for each energy. Far fewer exponentials give the same sum over
+the thicknesses that occur: energies are taken one by one where they help most, with
+non-negative weights, until the largest relative error on a set of thicknesses is below
+the tolerance. Then many more thicknesses are drawn; those that miss the tolerance join
+the set, and the fit is repeated. The result holds the tolerance on thicknesses that had
+no part in the choice; otherwise there is an error.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 SIGNAL_TOLERANCE = 1e-3
 """Largest relative error of the signal."""
 MIN_TRANSMISSION = 1e-4
-"""Transmission below which the error is relative to this value instead (about a count of
-14 bit)."""
+"""Transmission below which the error is relative to this value instead (about a
+count of 14 bit)."""
 MAX_ENERGIES = 48
 """Largest number of effective energies; six metals at once take about 25."""
 AIMED_SHARE = 0.5
@@ -50,7 +51,8 @@ class EffectiveBeam:
         signal: (k,) weights, adding up to the open beam's signal.
         noise: (k,) weights of the signal's variance.
         bins: (k,) their bins in the tables.
-        worst: largest relative error of the signal over thicknesses that had no part in choosing.
+        worst: largest relative error of the signal over thicknesses that had no part in
+            choosing.
     """
 
     names: tuple[str, ...]
@@ -91,8 +93,8 @@ def effective_beam(
     """Choose effective energies.
 
     Args:
-        signal: (e,) what each bin adds to the open beam's signal.
-        noise: (e,) what each bin adds to its variance.
+        signal: (e,) contribution of each bin to the open beam's signal.
+        noise: (e,) contribution of each bin to its variance.
         substances: m materials.
         thickest_mm: longest path through each [mm].
         tolerance: largest relative error of the signal.
@@ -151,8 +153,8 @@ def sample_paths(
     more: int = 1,
     seed: int = 0,
 ) -> FloatArray:
-    """Draw path lengths (j, m) [mm] that represent all that occur: alone, together, thin
-    and thick.
+    """Draw path lengths (j, m) [mm] that represent all that occur: alone, together,
+    thin and thick.
 
     They end at the thickness at which a material alone lets nearly nothing through, and
     begin at `MIN_OPTICAL_DEPTH`, apart from the open beam.

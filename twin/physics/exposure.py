@@ -1,9 +1,9 @@
 """From line integrals to the camera's counts: Beer-Lambert, dark level, noise, the 14-bit clip.
 
-`expose` turns the chord sums of one image (or of several moments within one exposure) into what
-the camera would save. The model is plain on purpose and its constants are assumed; `chain` takes
-its place behind the same call. Random numbers are an argument, with one generator for each frame,
-so that frames made in any order have the same bytes.
+`expose` turns the chord sums of one image (or of several moments within one exposure)
+into the camera's counts. The model is plain on purpose and its constants are assumed;
+`chain` takes its place behind the same call. Random numbers are an argument, with one
+generator for each frame, so that frames made in any order have the same bytes.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ Counts = npt.NDArray[np.uint16]
 
 @dataclass(frozen=True)
 class IdealResponse:
-    """Counts of the `ideal` physics: linear, of tube and detector together. All values but `bits`
-    are assumed.
+    """Counts of the `ideal` physics: linear, of tube and detector together. All values
+    but `bits` are assumed.
 
     Attributes:
         bits: depth; counts are clipped to [0, 2^bits - 1].
@@ -39,7 +39,7 @@ class IdealResponse:
             kV * power_W * exposure_ms, and knows no distance law.
         reference: (kV, W, ms) of `i0_counts`; default: the thesis's Listing 1.
         dark_counts: level without X-rays.
-        photons_per_count: detected photons one count stands for (sets the Poisson noise).
+        photons_per_count: detected photons per count (sets the Poisson noise).
         read_noise_counts: standard deviation of one read-out.
     """
 
@@ -73,8 +73,8 @@ class ExposureSettings:
 
 
 def ideal_response(machine: Machine) -> IdealResponse:
-    """Make the response of `machine`: at its own settings an open beam fills 3/4 of its
-    depth."""
+    """Make the response of `machine`: at its own settings an open beam fills
+    3/4 of its depth."""
     model = IdealResponse()
     tube = machine.tube
     scale = 2.0 ** (machine.detector.bits - model.bits)

@@ -1,7 +1,7 @@
-"""Image quality before a scan: what a ray's pixel will read, its noise, the dose on the axis.
+"""Image quality before a scan: count and noise of a ray's pixel, dose on the axis.
 
-Exact sums over the spectrum for a few rays, where whole images have effective energies. The noise
-is that of one saved image; structure that a flat image corrects is no noise.
+Exact sums over the spectrum for a few rays, where whole images have effective energies.
+The noise is that of one saved image; structure that a flat image corrects is no noise.
 """
 
 from __future__ import annotations
@@ -54,11 +54,11 @@ def pixel_reading(
     paths_mm: Sequence[float] = (),
     detail: tuple[Substance, float] | None = None,
 ) -> PixelValue:
-    """Forecast what a pixel reads behind materials, in surroundings that are like it.
+    """Forecast the count of a pixel behind materials, in surroundings that are like it.
 
     Args:
         chain: tube, materials, panel.
-        camera: its mode says how pixels are binned and read.
+        camera: its mode determines how pixels are binned and read.
         exposure: tube, time and averages.
         flux: the pixel's share of the charge at 1 m, see `chain.flux_map` [cm2].
         paths_mm: path through each of the chain's substances [mm]; nothing if left out.
@@ -99,8 +99,8 @@ def contrast_to_noise(background: PixelValue, detail: PixelValue) -> float:
 
 
 def air_kerma_mGy(chain: Chain, exposure: ExposureSettings, distance_mm: float) -> float:
-    """Compute the air kerma of one image at a distance from the source, with nothing in
-    between [mGy].
+    """Compute the air kerma of one image at a distance from the source, with
+    nothing in between [mGy].
 
     The energy that photons give to electrons of air: all of it in photoelectric
     absorption, the electron's mean share (Klein and Nishina) in Compton scattering.
@@ -131,8 +131,8 @@ def mass_energy_transfer(substance: Substance) -> FloatArray:
 
 
 def compton_share(energy_keV: npt.ArrayLike) -> FloatArray:
-    """Compute the mean part of a photon's energy that a free electron takes in Compton
-    scattering, (e,)."""
+    """Compute the mean part of a photon's energy that a free electron takes in
+    Compton scattering, (e,)."""
     cosine, weight = np.polynomial.legendre.leggauss(64)
     alpha = np.atleast_1d(np.asarray(energy_keV, dtype=np.float64))[:, None] / ELECTRON_KEV
     left = 1.0 / (1.0 + alpha * (1.0 - cosine))

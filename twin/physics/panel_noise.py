@@ -1,8 +1,9 @@
-"""The noise of a saved image, term by term: one model for images that are drawn and for forecasts.
+"""The noise of a saved image, term by term: one model for images that are drawn
+and for forecasts.
 
-Each of `NOISE` says how it is drawn, and what variance that has. `readout.read_out` draws all of
-them, `pixel_variance` adds their variances up. A term that is added to `NOISE` is thus in images
-and in forecasts.
+Each of `NOISE` has a function that draws it, and its variance. `readout.read_out` draws
+all of them, `pixel_variance` adds their variances up. A term that is added to `NOISE` is
+thus in images and in forecasts.
 """
 
 from __future__ import annotations
@@ -26,11 +27,12 @@ ROUNDING_COUNTS2: Final = 1.0 / 12.0
 
 @dataclass(frozen=True, eq=False)
 class Exposed:
-    """What the panel holds before an image is read out.
+    """Content of the panel before an image is read out.
 
     Attributes:
         mean_e: float32 (rows, cols), electrons of one read-out.
-        variance_e: float32 (rows, cols), what X-rays add to their variance in one read-out.
+        variance_e: float32 (rows, cols), contribution of X-rays to their variance in one
+            read-out.
         averages: read-outs that are averaged into the image.
         panel: the detector.
         camera: its mode.
@@ -49,11 +51,13 @@ class NoiseTerm:
 
     Attributes:
         name: of the source.
-        spreads: whether the scintillator's light spreads it over neighbours; otherwise it is white.
-        draw: makes the noise of a saved image before it spreads, float32 (rows, cols) [electrons].
-        variance_e2: gives a pixel's variance in one read-out before it spreads [electrons^2], from
-            panel, camera mode and the variance that X-rays have [electrons^2]; averaging divides
-            it by the number of read-outs.
+        spreads: whether the scintillator's light spreads it over neighbours; otherwise it
+            is white.
+        draw: makes the noise of a saved image before it spreads, float32 (rows, cols)
+            [electrons].
+        variance_e2: gives a pixel's variance in one read-out before it spreads
+            [electrons^2], from panel, camera mode and the variance that X-rays have
+            [electrons^2]; averaging divides it by the number of read-outs.
     """
 
     name: str
@@ -104,7 +108,8 @@ NOISE: tuple[NoiseTerm, ...] = (
     NoiseTerm("quanta", True, draw_quanta, quantum_variance),
     NoiseTerm("electronics", False, draw_electronics, electronic_variance),
 )
-"""Every source of noise. Random numbers are drawn in this order, for those that spread first."""
+"""Every source of noise. Random numbers are drawn in this order, for those
+that spread first."""
 
 
 def drawn(exposed: Exposed, rng: np.random.Generator, *, spreads: bool) -> Iterator[Float32Array]:
@@ -126,13 +131,15 @@ def drawn(exposed: Exposed, rng: np.random.Generator, *, spreads: bool) -> Itera
 def pixel_variance(
     panel: Detector, camera: CameraSettings, averages: int, xrays_e2: float
 ) -> float:
-    """Add up the variance of a pixel of a saved image in surroundings that are like it [counts^2].
+    """Add up the variance of a pixel of a saved image in surroundings that are
+    like it [counts^2].
 
     Args:
         panel: the detector.
-        camera: its mode says how pixels are binned and read.
+        camera: its mode determines how pixels are binned and read.
         averages: read-outs that are averaged into the image.
-        xrays_e2: variance that X-rays have in one read-out before light spreads [electrons^2].
+        xrays_e2: variance that X-rays have in one read-out before light spreads
+            [electrons^2].
     """
     kept = _kept_by_blur(panel.blur_px(camera))
     electrons = 0.0
@@ -143,8 +150,8 @@ def pixel_variance(
 
 
 def _kept_by_blur(sigmas_px: tuple[float, float]) -> float:
-    """Compute the part of a flat image's white noise that remains in a pixel where light
-    spreads."""
+    """Compute the part of a flat image's white noise that remains in a pixel
+    where light spreads."""
     if max(sigmas_px) < MIN_SIGMA_PX:
         return 1.0
     return math.prod(float((noise_kernel(s).astype(np.float64) ** 2).sum()) for s in sigmas_px)

@@ -158,7 +158,8 @@ def open_beam_of(
 
 
 def open_beam_doubt(machine: Machine, exposure: ExposureSettings, beam: OpenBeam) -> str | None:
-    """Say that an open beam saturates or starves the panel, and what would do; None if neither.
+    """Describe an open beam that saturates or starves the panel, and a better exposure;
+    None if neither.
 
     Args:
         machine: whose limits hold for the proposal.

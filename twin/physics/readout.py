@@ -65,10 +65,10 @@ def read_out(
         exposure: time and averages.
         rng: generator of this frame's noise; None for the expectation.
         before: noise-free electrons of earlier frames, each with the time [s] from its
-            end to this frame's start: what they leave behind is added.
+            end to this frame's start: the charge that they leave behind is added.
         trapped: electrons in traps at the frame's start, from `trapped_after`; None
-            without long lag. What they give back meanwhile is added, what they take is
-            lost.
+            without long lag. The charge that they release meanwhile is added, the charge
+            that they take is lost.
 
     Returns:
         uint16 (rows, cols).
@@ -122,7 +122,7 @@ def trapped_after(
     Args:
         panel: the detector.
         trapped: at the frame's start, (rows, cols).
-        expected: what falls on the panel in the frame; None in the dark.
+        expected: expected electrons of the frame; None in the dark.
         exposure: of the frame.
         gap_s: from its end to the next frame's start.
     """

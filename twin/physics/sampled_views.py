@@ -13,9 +13,9 @@ MAX_RAYS = 16
 
 
 def spot_views(rows: FloatArray, spot_mm: float, points: int) -> FloatArray:
-    """Sample a Gaussian focal spot: views (n, 12) become (n * points, 12), whose mean has
-    the spot's blur at every depth. A spiral, so that no two points are behind one
-    another.
+    """Sample a Gaussian focal spot: views (n, 12) become (n * points, 12), whose
+    mean has the spot's blur at every depth. A spiral, so that no two points are
+    behind one another.
 
     Args:
         rows: cone_vec rows.
@@ -39,7 +39,7 @@ def check_rays(rays: int) -> None:
     """Check a number of rays along each side of a pixel.
 
     Raises:
-        LimitError: says what is allowed.
+        LimitError: the message lists the allowed values.
     """
     if not isinstance(rays, int | np.integer) or rays not in range(1, MAX_RAYS + 1):
         allowed = f"1 to {MAX_RAYS} along each side of a pixel"

@@ -1,11 +1,13 @@
-"""Scatter images: what arrives on the panel after one or more interactions.
+"""Scatter images: signal on the panel after one or more interactions.
 
-The object is a coarse grid of material amounts, the panel a few hundred nodes; `ScatterImage`
-interpolates between them, which scatter, being smooth, allows. Everything is in units of the local
-open beam's signal, so that the image can be added to a transmission.
+The object is a coarse grid of material amounts, the panel a few hundred nodes;
+`ScatterImage` interpolates between them, which scatter, being smooth, allows. Everything
+is in units of the local open beam's signal, so that the image can be added to a
+transmission.
 
-Scatter changes slowly from view to view, so a scan of hundreds of views needs some tens of
-simulations; the views in between are interpolated linearly along the way of source and panel.
+Scatter changes slowly from view to view, so a scan of hundreds of views needs some tens
+of simulations; the views in between are interpolated linearly along the way of source and
+panel.
 """
 
 from __future__ import annotations
@@ -54,14 +56,15 @@ class ScatterSettings:
         error: standard error of a node at which the simulation stops, as part of the
             image's mean.
         nodes: of the panel, about; they are spread evenly from corner to corner.
-        voxels: of the grid that stands for the sample, about.
+        voxels: of the sample's grid, about.
         step_deg: views closer than this angle apart are interpolated; 0: every view by
             itself.
-        collimated: the beam ends at the panel's edges; else it lights the whole sample.
+        collimated: the beam ends at the panel's edges; else it illuminates the sample
+            completely.
         seed: another seed draws other photons.
 
     Raises:
-        LimitError: a setting that cannot be used; says what is allowed.
+        LimitError: a setting that cannot be used; the message lists the allowed values.
 
     Example:
         >>> ScatterSettings(error=0.01).step_deg
@@ -109,9 +112,9 @@ class Beam:
     """Spectrum and panel, by the energies of the attenuation tables.
 
     Attributes:
-        signal: (e,) what each energy adds to the open beam's signal; any unit.
+        signal: (e,) contribution of each energy to the open beam's signal; any unit.
         response: (e,) signal that one photon makes.
-        spread: (e,) what one photon adds to the signal's variance.
+        spread: (e,) contribution of one photon to the signal's variance.
     """
 
     signal: FloatArray
@@ -133,11 +136,12 @@ class ScatterImage:
         mean: (v, u) scatter.
         error: (v, u) its standard error.
         single: (v, u) the part of it that was scattered once.
-        spread: (v, u) what scatter adds to the variance, in units of the signal's charge.
+        spread: (v, u) contribution of scatter to the variance, in units of the signal's
+            charge.
         shape: the panel's (rows, cols); nodes are spread evenly from corner to corner.
         histories: photons followed.
-        balance: interacting photons, absorbed, escaped, and their energies [keV], in units of the
-            photons that interact.
+        balance: interacting photons, absorbed, escaped, and their energies [keV], in
+            units of the photons that interact.
     """
 
     mean: FloatArray
@@ -154,8 +158,8 @@ class ScatterImage:
 
 
 def spread_out(values: FloatArray, shape: tuple[int, int]) -> Float32Array:
-    """Interpolate values at nodes, (v, u), at every pixel: cubic splines, float32 (rows,
-    cols)."""
+    """Interpolate values at nodes, (v, u), at every pixel: cubic splines,
+    float32 (rows, cols)."""
     from scipy.interpolate import RectBivariateSpline
 
     rows, cols = shape
@@ -186,7 +190,7 @@ def scatter_image(
         stream: number of the view: others draw other photons.
 
     Raises:
-        GeometryError: the source lies beside or inside the object's box.
+        GeometryError: the source is beside or inside the object's box.
 
     Example:
         >>> water = Substance.of("water", "H2O", 1.0)
@@ -324,8 +328,8 @@ def _node_counts(shape: tuple[int, int], aspect: float, nodes: int) -> tuple[int
 def _lit(
     thing: Object, row: FloatArray, shape: tuple[int, int], collimated: bool
 ) -> tuple[float, float, float, float]:
-    """Project the object's box on the panel's plane: least column and row, greatest, from
-    its centre."""
+    """Project the object's box on the panel's plane: least column and row,
+    greatest, from its centre."""
     source = row[0:3]
     centre = row[3:6]
     u = row[6:9]
@@ -356,7 +360,7 @@ class ScanScatter:
     Attributes:
         settings: how it was simulated.
         images: of the simulated views.
-        simulated: (k,) their indices in the whole scan, growing.
+        simulated: (k,) their indices in the scan, growing.
         way: (n,) how far source and panel have come at each view [rad].
         known: (k,) the same at the simulated ones.
     """
@@ -445,7 +449,7 @@ def view_scatter(
         settings: how; `step_deg` does not count.
 
     Raises:
-        GeometryError: the source lies beside or inside the object's box.
+        GeometryError: the source is beside or inside the object's box.
     """
     row = np.ascontiguousarray(view, dtype=np.float64)
     stream = int.from_bytes(blake2b(row.tobytes(), digest_size=8).digest(), "little")
@@ -471,7 +475,7 @@ def scan_scatter(
         settings: of the simulation.
 
     Raises:
-        GeometryError: the source lies beside or inside the object's box in a view.
+        GeometryError: the source is beside or inside the object's box in a view.
         LimitError: no views.
     """
     wanted = ScatterSettings() if settings is None else settings

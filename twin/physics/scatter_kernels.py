@@ -1,18 +1,19 @@
 """Photons through voxels: forced interaction, forced detection, random numbers from a counter.
 
-One history is one photon with a weight. Its first flight is forced to end inside the object, so
-that no history is lost, and so is every later one; absorption lowers the weight. From each
-interaction the expected signal is sent along straight lines to nodes on the panel ("forced
-detection", Kalos, Nucl. Sci. Eng. 16 (1963) 111; with fixed nodes: Poludniowski et al., Phys. Med.
-Biol. 54 (2009) 3847): no photon has to hit the panel by chance. Then the photon is turned by a
-sampled angle.
+One history is one photon with a weight. Its first flight is forced to end inside the
+object, so that no history is lost, and so is every later one; absorption lowers the
+weight. From each interaction the expected signal is sent along straight lines to nodes on
+the panel ("forced detection", Kalos, Nucl. Sci. Eng. 16 (1963) 111; with fixed nodes:
+Poludniowski et al., Phys. Med. Biol. 54 (2009) 3847): no photon has to hit the panel by
+chance. Then the photon is turned by a sampled angle.
 
-The first interaction's numbers (place in the beam, energy, depth, material, nodes) are points of a
-Sobol sequence, scrambled anew for each batch (Owen, J. Complexity 14 (1998) 466), which converges
-faster than random points and leaves independent batches whose spread is the standard error. Later
-numbers are a mixed counter (SplitMix64: Steele, Lea and Flood, OOPSLA 2014) that starts from the
-batch's key and the history's number. A batch is summed by one thread in the order of its histories,
-so the image is the same for any number of threads.
+The first interaction's numbers (place in the beam, energy, depth, material, nodes) are
+points of a Sobol sequence, scrambled independently for each batch (Owen, J. Complexity 14
+(1998) 466), which converges faster than random points and leaves independent batches
+whose spread is the standard error. Later numbers are a mixed counter (SplitMix64: Steele,
+Lea and Flood, OOPSLA 2014) that starts from the batch's key and the history's number. A
+batch is summed by one thread in the order of its histories, so the image is the same for
+any number of threads.
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ their energies [keV]."""
 DIMENSIONS = 6
 """Number of random numbers of the first interaction."""
 ROULETTE = 0.15
-"""Weight, as part of the first, below which a photon survives with the chance weight /
-ROULETTE."""
+"""Weight, as part of the first, below which a photon survives with the chance
+weight / ROULETTE."""
 MAX_ORDERS = 100
 """Largest number of interactions of a photon."""
 
@@ -119,8 +120,8 @@ def travel(amounts, lower, edge, p, d, mu, stop, paths):
     while True:
         onward = min(tx, min(ty, tz))
         length = max(onward - here, 0.0)
-        # Where a depth is to be reached, the voxel in which that happens is divided; otherwise only
-        # lengths are added up, which serve any energy.
+        # Where a depth is to be reached, the voxel in which that happens is divided;
+        # otherwise only lengths are added up, which serve any energy.
         if ends:
             local = 0.0
             for m in range(materials):
@@ -201,9 +202,9 @@ def chosen_material(amounts, lower, edge, p, mu, number):
 
 @kernel
 def coherent_cosine(state, energy, cumulated, root_step):
-    """Draw the angle of a coherent interaction: x^2 from the running integral of F^2,
-    then Thomson's (1 + cos^2) / 2 by rejection (Persliden, Comput. Programs Biomed. 17
-    (1983) 115)."""
+    """Draw the angle of a coherent interaction: x^2 from the running integral of
+    F^2, then Thomson's (1 + cos^2) / 2 by rejection (Persliden, Comput. Programs
+    Biomed. 17 (1983) 115)."""
     # x = sin(angle / 2) E / hc; the tables are evenly spaced in sqrt(x), finest near 0, where
     # form factors fall. Backward (cosine -1) is x = E / hc, beyond which nothing is drawn.
     greatest = energy / HC_KEV_A
@@ -271,9 +272,9 @@ def detect(
 ):  # fmt: skip
     """Send the expected signal of an interaction at p to `fan` of the nodes.
 
-    Every len(nodes) / fan-th node is taken from `start` on, so each is as likely as any other.
-    `weight` holds everything but the differential cross-section in units of the attenuation
-    coefficient, the attenuation on the way and the node's solid angle.
+    Every len(nodes) / fan-th node is taken from `start` on, so each is as likely as any
+    other. `weight` holds everything but the differential cross-section in units of the
+    attenuation coefficient, the attenuation on the way and the node's solid angle.
     """
     number = len(nodes)
     share = weight * number / fan / mu[m]
@@ -286,7 +287,7 @@ def detect(
         scale = 1.0 / math.sqrt(square)
         v[0], v[1], v[2] = v[0] * scale, v[1] * scale, v[2] * scale
         slant = v[0] * normal[0] + v[1] * normal[1] + v[2] * normal[2]
-        if slant <= 0.0:  # the interaction lies behind the panel
+        if slant <= 0.0:  # the interaction is behind the panel
             continue
         cosine = min(max(d[0] * v[0] + d[1] * v[1] + d[2] * v[2], -1.0), 1.0)
         x = energy / HC_KEV_A * math.sqrt(0.5 * (1.0 - cosine))
@@ -294,8 +295,8 @@ def detect(
         k = 1.0 / (1.0 + energy / ELECTRON_KEV * (1.0 - cosine))
         coherent = 0.5 * (1.0 + cosine * cosine) * between(form[m], column)
         incoherent = 0.5 * k * k * (k + 1.0 / k - 1.0 + cosine * cosine) * between(shell[m], column)
-        # A coherent photon keeps its energy on the way to the node, an incoherent one has k of it
-        # and is weakened more: one walk gives the lengths for both.
+        # A coherent photon keeps its energy on the way to the node, an incoherent one has
+        # k of it and is weakened more: one walk gives the lengths for both.
         travel(amounts, lower, edge, p, v, mu, np.inf, paths)
         to_bin = (energy * k - first_keV) / step_keV
         depth, softer = 0.0, 0.0
@@ -316,25 +317,28 @@ def histories(
     nodes, per_open, amounts, lower, edge, first_keV, step_keV, total, coherent, incoherent,
     root_step, form, shell, cumulated, bins, chances, photons, response, spread, images, tallies,
 ):  # fmt: skip
-    """Follow histories in each batch and add what they give to the images.
+    """Follow histories in each batch and add their signals to the images.
 
     Args:
-        points: (b, n, DIMENSIONS) numbers of the first interactions of each batch's n histories.
+        points: (b, n, DIMENSIONS) numbers of the first interactions of each batch's n
+            histories.
         first: number of the first history.
         keys: (b,) uint64, the batches' streams.
         fans: (2,) nodes that the first interaction and each later one send to.
         orders: interactions at most.
         source: (3,) focal spot [mm].
-        corner, along_u, along_v, normal: (3,) of the panel's plane: a corner of the lit rectangle,
-            its edges [mm], unit vector away from the source.
+        corner, along_u, along_v, normal: (3,) of the panel's plane: a corner of the lit
+            rectangle, its edges [mm], unit vector away from the source.
         lit: area of the rectangle [mm2].
         nodes, per_open: (n, 3) [mm] and (n,) one over the open beam there [mm2 sr].
         amounts, lower, edge: as for `travel`.
         first_keV to cumulated: the cross-sections.
         bins, chances: (s,) the spectrum's bins and the running chances to draw them.
-        photons: (s,) photons of each in a history of the open beam's signal, over that chance.
+        photons: (s,) photons of each in a history of the open beam's signal, over that
+            chance.
         response, spread: (e,) signal and variance of a photon, by energy.
-        images: (b, n, 3) float64, added to, in units of the open beam's signal for one history.
+        images: (b, n, 3) float64, added to, in units of the open beam's signal for one
+            history.
         tallies: (b, TALLIES) float64, added to.
     """
     materials, number = amounts.shape[3], len(nodes)
@@ -342,8 +346,9 @@ def histories(
         image, tally = images[batch], tallies[batch]
         mu, paths, v = np.empty(materials), np.empty(materials), np.empty(3)
         p, d = np.empty(3), np.empty(3)
-        # `scale` is what the history stands for in the open beam and stays; `weight` begins at 1
-        # and changes with absorption and forced flights: the roulette compares it with one number.
+        # `scale` is what the history stands for in the open beam and stays; `weight`
+        # begins at 1 and changes with absorption and forced flights: the roulette
+        # compares it with one number.
         for history in range(points.shape[1]):
             sobol = points[batch, history]
             # An even point of the lit rectangle: its solid angle is the history's first weight.
@@ -389,7 +394,7 @@ def histories(
                 )  # fmt: skip
                 if order == orders - 1:
                     break
-                # Absorption is a loss of weight; what is left goes on, coherent or incoherent.
+                # Absorption is a loss of weight; the rest goes on, coherent or incoherent.
                 from_bin = (energy - first_keV) / step_keV
                 elastic, inelastic = (
                     between(coherent[m], from_bin),
@@ -424,8 +429,8 @@ def histories(
                 state, pick = draw(state)
                 stop, gain = depth_drawn(pick, depth)
                 weight *= gain
-                # Light photons are ended by chance, and those that survive weigh more: the sum is
-                # the same on average, and time is not spent on what hardly counts.
+                # Light photons are ended by chance, and those that survive weigh more:
+                # the sum is the same on average, and no time is spent on light photons.
                 if weight < ROULETTE:
                     state, pick = draw(state)
                     if pick * ROULETTE >= weight:

@@ -1,10 +1,10 @@
-"""What a scintillator of any material keeps of a photon's energy.
+"""Part of a photon's energy that a scintillator of any material keeps.
 
-Photons interact along a straight line. A photoelectric one leaves its energy, less that of a K
-photon that escapes; a Compton one leaves that of the electron, and of the scattered photon if it is
-absorbed on its way out. K photons and scattered ones go into all directions alike and interact once
-more or escape through front or back. Coherent scattering is left out: it goes forward and takes no
-energy.
+Photons interact along a straight line. A photoelectric one leaves its energy, less that
+of a K photon that escapes; a Compton one leaves that of the electron, and of the
+scattered photon if it is absorbed on its way out. K photons and scattered ones go into
+all directions alike and interact one more time or escape through front or back. Coherent
+scattering is left out: it goes forward and takes no energy.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ K_SHELL: Final = {
     "Cs": (35.985, 0.813, 0.898, (30.85, 35.1)),
     "Gd": (50.239, 0.795, 0.935, (42.75, 48.8)),
 }
-"""Edge [keV], part of the absorption above it (the edge's jump in the tables), fluorescence yield
-(Krause, J. Phys. Chem. Ref. Data 8 (1979) 307), energies of K-alpha and K-beta [keV]. Of other
-elements no fluorescence escapes here."""
+"""Edge [keV], part of the absorption above it (the edge's jump in the tables),
+fluorescence yield (Krause, J. Phys. Chem. Ref. Data 8 (1979) 307), energies of K-alpha
+and K-beta [keV]. Of other elements no fluorescence escapes here."""
 K_ALPHA_SHARE: Final = 0.81
 """Part of K-alpha among K photons."""
 SLICES: Final = 60
@@ -75,8 +75,7 @@ def deposited(screen: Filter) -> Deposited:
     here = np.broadcast_to((stopped / stopping / SLICES)[:, None], depth.shape)
 
     def escaping(mu: FloatArray) -> FloatArray:
-        """Compute the part that escapes of what starts evenly into all directions, (e,
-        slice)."""
+        """Compute the part of isotropic photons that escapes, (e, slice)."""
         return np.asarray(
             (expn(2, mu[..., None] * depth) + expn(2, mu[..., None] * (thick - depth))) / 2.0
         )

@@ -1,10 +1,10 @@
 """The tube: how many photons of each energy it emits, and how large its focal spot is.
 
-Spectra come from the shipped tables, linear between neighbouring voltages; a voltage outside the
-tables is an error. The anode angle is the tables' 12 degrees; filters and focal spot come from the
-machine file, whose defaults are assumed, since nothing public states them for this tube. `Tube` is
-what a user states for `flexdt.simulate`; it becomes the values that the chain works with,
-`TubeModel` and `ExposureSettings`.
+Spectra come from the shipped tables, linear between neighbouring voltages; a voltage
+outside the tables is an error. The anode angle is the tables' 12 degrees; filters and
+focal spot come from the machine file, whose defaults are assumed, since nothing public
+states them for this tube. `Tube` is the user's description for `flexdt.simulate`; it
+becomes the values that the chain works with, `TubeModel` and `ExposureSettings`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _FILTER = "tube_filter_"
 
 @dataclass(frozen=True)
 class Filter:
-    """A layer the whole beam goes through [mm]."""
+    """A layer in the path of the beam [mm]."""
 
     substance: Substance
     thickness_mm: float
@@ -42,12 +42,12 @@ class TubeModel:
     """Properties of a tube's beam besides kV and power. All defaults are assumed.
 
     Attributes:
-        filters: from the anode to the sample; 0.5 mm aluminium stands for window and
-            inherent filtration.
+        filters: from the anode to the sample; 0.5 mm aluminium, for window and inherent
+            filtration.
         spot_mm_per_W: the electron beam of microfocus tubes is widened with power so that
             the anode does not melt; about a micrometre a watt is usual.
         smallest_spot_mm: focal spot at little power (full width at half maximum).
-        spot_points: from which the twin's rays start; 1 for one blur of the whole image.
+        spot_points: from which the twin's rays start; 1 for one blur of the image.
     """
 
     filters: tuple[Filter, ...] = field(default_factory=lambda: (Filter(ALUMINIUM, 0.5),))
@@ -185,16 +185,16 @@ class Tube:
     Args:
         kV: tube voltage; the spectrum is tungsten's at 12 degrees, 20 to 240 kV.
         power_W: power on the anode [W]; power_W / kV is the current [mA].
-        filters: layers from the anode to the sample, (name of a material, as samples have it, or
-            FORMULA@DENSITY in g/cm3, thickness [mm]) each; None for 0.5 mm of aluminium, () for
-            nothing.
-        spot_mm: focal spot, full width at half maximum [mm]; None: 1 um for each watt, at least
-            7 um.
-        mono_keV: all photons have this energy, as many as give the spectrum's signal in the open
-            beam; None for the whole spectrum.
+        filters: layers from the anode to the sample, (name of a material, as samples have
+            it, or FORMULA@DENSITY in g/cm3, thickness [mm]) each; None for 0.5 mm of
+            aluminium, () for nothing.
+        spot_mm: focal spot, full width at half maximum [mm]; None: 1 um for each watt, at
+            least 7 um.
+        mono_keV: all photons have this energy, as many as give the spectrum's signal in
+            the open beam; None for the full spectrum.
 
     Raises:
-        LimitError: a setting that has no spectrum; says what is allowed.
+        LimitError: a setting that has no spectrum; the message lists the allowed values.
         UnknownNameError: a material or an element without a table.
 
     Example:

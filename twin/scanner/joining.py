@@ -1,15 +1,15 @@
-"""How new motion joins what is under way, so that what runs is always one swept programme.
+"""Join new motion to the present one, so that the motors always follow one swept programme.
 
-A `Lookahead` is all motors at one moment, with the guard that finds the first contact along any
-motion of all of them. From what is asked it makes the first programme that is certified: swept as a
-whole, or passing nothing but a path that was. Where there is none, nothing changes: the programme
-in force stays free, since it was certified with all motors in it. This module returns values; the
-scanner takes them over.
+A `Lookahead` is all motors at one moment, with the guard that finds the first contact
+along any motion of all of them. It makes the first programme that is certified: swept
+completely, or along a path that was. Where there is none, nothing changes: the programme
+in force stays free, since it was certified with all motors in it. This module returns
+values; the scanner takes them over.
 
-Another sample or correction may be put in force under motors that stand or move. What stands on the
-stage and where changes with the sample and with the correction. Both are certified as moves are:
-whatever is under way must be free of the new stage, or at least a stop of it, and where nothing
-moves no pair may come within the safety margin.
+Another sample or correction may be put in force while motors are at rest or moving. The
+bodies on the stage and their places change with the sample and with the correction. Both
+are certified as moves are: whatever is under way must be free of the new stage, or at
+least a stop of it, and where nothing moves no pair may come within the safety margin.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ MAX_SWEPT_LEGS = 500
 
 @dataclass(frozen=True)
 class Joined:
-    """A certified programme that does what was requested, or the free part of it.
+    """A certified programme that follows the request, or the free part of it.
 
     For a change of the stage it is the programme under way, or its halt.
 
@@ -101,11 +101,12 @@ class StopMotion:
 
     Attributes:
         trajectories: of the motors whose programme changes.
-        path: `along` the path they were on together; `apart`, each motor by itself, on a path that
-            was swept for it; `coasting`, without power, on a path that nothing keeps free.
+        path: `along` the path they were on together; `apart`, each motor by itself, on a
+            path that was swept for it; `coasting`, without power, on a path that nothing
+            keeps free.
         duration_s: until all motors rest.
         distances: motor -> how far it still travels [mm, deg], of those that move.
-        would_hit: what coasting runs into; None for the other two.
+        would_hit: contact while coasting; None for the other two.
     """
 
     trajectories: Trajectories
@@ -138,7 +139,7 @@ class Lookahead:
         machine: which motors are coupled, and the greatest acceleration they can brake
             with.
         guard: finds the first contact; None finds none.
-        drives: every motor with its whole programme.
+        drives: every motor with its complete programme.
         now: the moment [s].
     """
 
@@ -157,8 +158,8 @@ class Lookahead:
         return {n: d.ahead(self.now) for n, d in self.drives.items() if d.end > self.now}
 
     def contact(self, trajectories: Trajectories, since: float | None = None) -> Contact | None:
-        """Find the first contact if some motors follow `trajectories`, the others their
-        programme.
+        """Find the first contact if some motors follow `trajectories`, the
+        others their programme.
 
         Args:
             trajectories: motor -> trajectory.
@@ -177,7 +178,7 @@ class Lookahead:
 
         Args:
             deep: measure overlaps.
-            standing: of parts where they stand, as `Guard.standing` has them.
+            standing: of parts at their present places, as `Guard.standing` has them.
         """
         here = {name: d.at(self.now).position(self.now) for name, d in self.drives.items()}
         if self.guard is None:
@@ -185,12 +186,13 @@ class Lookahead:
         guard = self.guard.standing(here) if standing else self.guard
         return guard.touching(here, deep=deep)
 
-    # Joining ------------------------------------------------------------------------------------
+    # Joining
+    # ------------------------------------------------------------------------------------
 
     def joined(self, new: Trajectories) -> Joined:
         """Find the first certified programme of these three, or none.
 
-        1. The new motors do what is asked, the others carry on.
+        1. The new motors follow the request, the others carry on.
         2. The new motors halt before the contact, the others carry on.
         3. All halt along the new path, where the new motors are under way already and have
            nothing else that is free.
@@ -217,8 +219,8 @@ class Lookahead:
         return far or here.velocity(self.now) != 0.0
 
     def _alone(self, new: Trajectories, contact: Contact) -> dict[str, Trajectory] | None:
-        """Shorten the motion of a single motor to its last free position; None if that is
-        not free."""
+        """Shorten the motion of a single motor to its last free position; None if
+        that is not free."""
         if len(new) != 1:
             return None
         ((name, planned),) = new.items()
@@ -266,8 +268,6 @@ class Lookahead:
         """Find a late moment before the contact for which `holds`; None if none is found.
 
         Steps back from the contact double until it holds, then bisection.
-
-        First ever farther back from the contact, then bisection.
         """
         late = contact.last_free_time
         back = FIRST_LEAD_S
@@ -287,13 +287,15 @@ class Lookahead:
                 late = middle
         return early
 
-    # Stopping -----------------------------------------------------------------------------------
+    # Stopping
+    # -----------------------------------------------------------------------------------
 
     def stopped(self, most: Most = None) -> StopMotion:
         """Stop everything: along the path, or quicker where a sweep shows that free.
 
         Args:
-            most: motor -> greatest acceleration; None: what the motion was planned with.
+            most: motor -> greatest acceleration; None: those that the motion was planned
+                with.
         """
         along = braked_along(self.drives, self.now, most)
         try:
@@ -305,8 +307,8 @@ class Lookahead:
         return StopMotion.of(along, "along", self.now)
 
     def _quicker(self, along: Trajectories, most: Most) -> dict[str, Trajectory] | None:
-        """Find a quicker stop: along the path for a while, then each motor by itself, if
-        free."""
+        """Find a quicker stop: along the path for a while, then each motor by
+        itself, if free."""
         whole = max((t.end for t in along.values()), default=self.now) - self.now
         due = [n for n, d in self.drives.items() if d.end > self.now]
         strongest = {
@@ -320,15 +322,17 @@ class Lookahead:
             if max((t.end for t in apart.values()), default=at) > self.now + whole - MIN_GAIN_S:
                 return None
             trajectories = {n: motion.rejoined(along[n], at, rest) for n, rest in apart.items()}
-            # The one motor that has anything to do brakes on the path that it was swept on. Where
-            # another is to set off later, it may rely on the room that one would make.
+            # The one motor that has anything to do brakes on the path that it was swept
+            # on. Where another is to set off later, it may rely on the room that one
+            # would make.
             alone = not share and len(due) == 1
             free = alone or self.contact({**along, **trajectories}, since=at) is None
             if free and self._within_travel(trajectories):
                 return {**along, **trajectories}
         return None
 
-    # Changes of the stage -----------------------------------------------------------------------
+    # Changes of the stage
+    # -----------------------------------------------------------------------
 
     def on(self, guard: Guard | None) -> Lookahead:
         """Return the same motors with another stage's guard."""
@@ -388,7 +392,7 @@ class UnsweptProgramme:
 
     Attributes:
         programme: motor -> trajectories on a clock that shows 0 when it is taken over.
-        start: where every motor stands then, at rest [mm, deg].
+        start: position of every motor then, at rest [mm, deg].
         version: of the stage and of the stops that it is prepared for.
         guard: of that stage.
     """
@@ -399,7 +403,7 @@ class UnsweptProgramme:
     guard: Guard | None = field(repr=False)
 
     def certified(self) -> CertifiedProgramme:
-        """Sweep the whole programme; takes about 60 ms for 1440 steps."""
+        """Sweep the programme to its end; takes about 60 ms for 1440 steps."""
         standing = {name: motion.at_rest(x, 0.0) for name, x in self.start.items()}
         legs = {name: motion.joined(legs) for name, legs in self.legs.items()}
         contact = None if self.guard is None else self.guard({**standing, **legs}, 0.0)
@@ -425,17 +429,17 @@ class CertifiedProgramme:
 
 @dataclass(frozen=True)
 class StageChange:
-    """A change of the stage with its sweep's inputs; frozen, so that the sweep may run in
-    a thread.
+    """A change of the stage with its sweep's inputs; frozen, so that the sweep may
+    run in a thread.
 
     Attributes:
-        sample: what is to stand on the stage.
-        correction: what is to be in force; None for none.
+        sample: the sample to be on the stage.
+        correction: the correction to be in force; None for none.
         guard: finds contacts with both of them.
         ahead: all motors, with the guard that is in force.
         version: of the stage, the stops and the programmes that it is made for.
         moves: motor -> trajectory that begins with the change.
-        targets, paces: what those moves come from.
+        targets, paces: origin of those moves.
     """
 
     sample: Sample
@@ -453,14 +457,14 @@ class StageChange:
         """Judge the change; return it with the verdict.
 
         Raises:
-            CollisionError: what is under way is not free of the new stage, and no stop of
-                it is.
+            CollisionError: the present motion is not free of the new stage, and no stop
+                of it is.
         """
         return replace(self, found=self.verdict())
 
     def renewed(self, before: StageChange) -> Joined:
-        """Judge the change at the takeover, reusing the verdict found `before`; raises as
-        `verdict`.
+        """Judge the change at the takeover, reusing the verdict found `before`;
+        raises as `verdict`.
 
         Raises:
             SafetyError: a long programme has begun meanwhile; nothing changes.
@@ -468,7 +472,7 @@ class StageChange:
         still = before.version == self.version and not self.moves
         found = before.found
         if still and found is not None and found.contact is None:
-            return Joined({})  # what was free to its end is so still
+            return Joined({})  # a motion that was free to its end still is
         if self.ahead.legs <= MAX_SWEPT_LEGS:
             return self.verdict()
         if still and found is not None and found.contact is not None:
@@ -479,8 +483,8 @@ class StageChange:
         raise SafetyError(what, {"allowed": "asking again"})
 
     def verdict(self) -> Joined:
-        """Judge whether what is under way may carry on, or how it is halted; raises as
-        `certified`."""
+        """Judge whether what is under way may carry on, or how it is halted;
+        raises as `certified`."""
         changed = self.ahead.on(self.guard)
         now = self.ahead.now
         under_way = self.ahead.ahead()

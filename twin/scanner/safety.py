@@ -1,12 +1,13 @@
-"""The safety state as a pure machine: what happens on a contact, an E-stop, a reset.
+"""The safety state as a pure machine: transitions on a contact, an E-stop, a reset.
 
-`ready` takes every command. A motion that a contact cuts short is halted at its last free position
-and counts as a blocked attempt; a motion that ends freely clears the count. At the machine's
-`max_blocked_attempts` the state is `blocked`: motion is rejected until a reset (thesis 4.4.4).
-While parts are in contact the state is `blocked` too; a reset does not change that, and the only
-motions allowed are those that bring no touching pair nearer. `estopped` rejects motion and X-rays
-until a reset. Each E-stop and each block has a number, so that a reset can say which one it is to
-release. `Guard` is the interface of contact detection; `collision` implements it.
+`ready` takes every command. A motion that a contact cuts short is halted at its last free
+position and counts as a blocked attempt; a motion that ends freely clears the count. At
+the machine's `max_blocked_attempts` the state is `blocked`: motion is rejected until a
+reset (thesis 4.4.4). While parts are in contact the state is `blocked` too; a reset does
+not change that, and the only motions allowed are those that bring no touching pair
+nearer. `estopped` rejects motion and X-rays until a reset. Each E-stop and each block has
+a number, so that a reset can name the one to release. `Guard` is the interface of contact
+detection; `collision` implements it.
 """
 
 from __future__ import annotations
@@ -30,11 +31,11 @@ ROUNDING_MM = 1e-4
 
 
 def floor(gap: float, margin: float) -> float:
-    """Compute the gap that two parts keep from now on, whatever the commands, until they
-    separate.
+    """Compute the gap that two parts keep from now on, whatever the commands,
+    until they separate.
 
     Floors are rungs of a ladder, `RUNG_MM` apart. Its top rung is one above the safety
-    margin, and what is free keeps to that. A pair that is nearer (after a restart with
+    margin, and free parts keep to that. A pair that is nearer (after a restart with
     another machine file, or after coasting) keeps to the rung below its gap. The rungs do
     not move, and a gap that was kept above a rung has a floor no lower than that rung: so
     a thousand motions, new samples, corrections and restarts take no more from a gap than
@@ -45,9 +46,8 @@ def floor(gap: float, margin: float) -> float:
         margin: the machine's safety margin [mm].
 
     Returns:
-        The least gap allowed [mm]; no more than `gap`, so that what has sunk below its
-        rung by
-        rounding may go anywhere but nearer.
+        The least gap allowed [mm]; no more than `gap`, so that a pair below its rung by
+        rounding may move anywhere but nearer.
     """
     rung = 1.0
     if gap < margin + RUNG_MM:
@@ -83,8 +83,8 @@ class Guard(Protocol):
     """Finds contacts on one stage; it changes nothing."""
 
     def __call__(self, trajectories: Mapping[str, Trajectory], now: float, /) -> Contact | None:
-        """Find the first contact from `now` on, given the trajectory of every motor; None
-        if none."""
+        """Find the first contact from `now` on, given the trajectory of every
+        motor; None if none."""
 
     def touching(
         self, positions: Mapping[str, float], *, deep: bool = False
@@ -95,14 +95,14 @@ class Guard(Protocol):
         """
 
     def standing(self, positions: Mapping[str, float]) -> Guard:
-        """Return the guard of the same parts fixed at a pose, without what they may sweep."""
+        """Return the guard of the same parts fixed at a pose, without their sweep."""
 
 
 def require_ready(safety: Safety, what: str) -> None:
     """Check that motion is allowed.
 
     Raises:
-        SafetyError: E-stop in force, or blocked; says how to get out.
+        SafetyError: E-stop in force, or blocked; the message includes the way out.
     """
     if safety.state == "estopped" or (safety.state == "blocked" and safety.contact is None):
         raise SafetyError(
@@ -193,7 +193,7 @@ def collision_error(
     """Make the error for a motion that a contact cut short.
 
     Args:
-        contact: what would have touched.
+        contact: the two parts and the time.
         now: time of the command [s].
         safety: the state after it.
         what: the command, for people.
@@ -236,7 +236,7 @@ def would_touch(
         ahead: time until they meet [s]; 0 for parts that are near now.
         last_free: motor -> last free position [mm, deg].
         near: words for parts that are near now.
-        outcome: words for what happens instead.
+        outcome: words for the actual outcome.
         data: further members of the error's data.
     """
     how = f"would collide in {ahead:.3g} s" if ahead > 0.0 else near

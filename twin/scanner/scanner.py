@@ -1,10 +1,11 @@
-"""`ScannerTwin`, the one mutable object: where every motor is bound, tube, camera, sample, safety.
+"""`ScannerTwin`, the one mutable object: where every motor is bound, tube,
+camera, sample, safety.
 
-Nothing in it ticks: each method takes `now`, the time of the twin's clock in seconds, and any
-reader may ask for positions, poses or the whole state at any `now`. What the motors follow is
-always one programme of all of them that was swept as a whole and ends at rest; `_take` is the only
-place where it is replaced, and takes nothing that was not certified (see `joining`). A hidden
-misalignment is known to the server's projection path alone.
+Nothing in it ticks: each method takes `now`, the time of the twin's clock in seconds, and
+positions, poses or the complete state can be read at any `now`. The motors always follow
+one programme of all of them that was swept to its end and ends at rest; `_take` is the
+only place where it is replaced, and takes nothing that was not certified (see `joining`).
+A hidden misalignment is known to the server's projection path alone.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ class ScannerTwin:
     Args:
         machine: its description.
         profile: zero offsets in force.
-        now: time at which it stands at home [s].
+        now: time at which it is at home [s].
         guard: finds the first contact along planned motion; None sweeps nothing.
         last_stop: number of the stop before the first one here (`Safety.stop`).
     """
@@ -93,14 +94,15 @@ class ScannerTwin:
         self._drives: dict[str, Drive] = plan.home(machine, now)
         self._coasts_until = -math.inf
         self._stage = self._stops = self._programmes = 0
-        """How often the stage was changed, motion stopped, another programme begun: what is
-        certified is bound to these."""
+        """How often the stage was changed, motion stopped, another programme begun: a
+        certificate is bound to these."""
         self._derived: tuple[object, Readout | None] = (None, None)
-        """The last readout, and what it was made of."""
+        """The last readout, and its inputs."""
         self._judged: tuple[object, tuple[str, str] | None] = (None, None)
         """The last pair in contact, and the positions and stage that it was found for."""
 
-    # Reading ------------------------------------------------------------------------------------
+    # Reading
+    # ------------------------------------------------------------------------------------
 
     def trajectories(self, now: float) -> dict[str, Trajectory]:
         """Return the trajectory in force of every motor."""
@@ -119,7 +121,7 @@ class ScannerTwin:
         return {name: d.at(now).target for name, d in self._drives.items()}
 
     def final_positions(self) -> dict[str, float]:
-        """Return where every motor stands when its programme has ended [mm, deg]."""
+        """Return the position of every motor after its programme [mm, deg]."""
         return {name: d.final for name, d in self._drives.items()}
 
     def moving(self, now: float) -> bool:
@@ -167,8 +169,8 @@ class ScannerTwin:
         return self.poses_at(self.positions(now), self.camera)
 
     def poses_at(self, positions: Mapping[str, npt.ArrayLike], camera: CameraSettings) -> Poses:
-        """Compute nominal poses for positions [mm, deg], scalars or (n,), and any camera
-        settings."""
+        """Compute nominal poses for positions [mm, deg], scalars or (n,), and
+        any camera settings."""
         return motor_poses(self.machine, self.profile, camera, positions)
 
     def corrected(
@@ -222,7 +224,8 @@ class ScannerTwin:
             self._derived = (made_of, readout(poses, self.camera, sensor, self.parameters))
         return self._derived[1]
 
-    # Motion -------------------------------------------------------------------------------------
+    # Motion
+    # -------------------------------------------------------------------------------------
 
     def move(
         self,
@@ -238,7 +241,8 @@ class ScannerTwin:
             targets: motor or virtual axis -> position [mm, deg], script's sign.
             now: time of the command [s].
             relative: targets are displacements from where the motors are bound for.
-            shortest: rotations go the shorter way round; otherwise angles are accumulated.
+            shortest: rotations go the shorter way round; otherwise angles are
+                accumulated.
 
         Returns:
             Motor -> seconds until it rests.
@@ -246,8 +250,9 @@ class ScannerTwin:
         Raises:
             UnknownNameError, LimitError: nothing moves.
             SafetyError: E-stopped or blocked; nothing moves.
-            CollisionError: a contact lies ahead. The motion halts before it where that is free, and
-                else nothing changes; the error's data says which (`halts_at`).
+            CollisionError: a contact is ahead. The motion halts before it where that is
+                free, and else nothing changes; the error's data has the outcome
+                (`halts_at`).
         """
         self._require_ready("motion", now)
         new = plan.plan_move(
@@ -307,9 +312,9 @@ class ScannerTwin:
     def jog(self, axis: str, velocity: float, lease_s: float, now: float) -> JogMotion:
         """Run `axis` at `velocity` until the lease ends or a limit nears, then brake.
 
-        A jog that a contact cuts short runs as far as it is free, and says so. One that
-        cannot go at all is a blocked attempt and changes nothing: the lease that it was
-        to renew runs out.
+        A jog that a contact cuts short runs as far as it is free, and returns the
+        contact. One that cannot go at all is a blocked attempt and changes nothing: the
+        lease that it was to renew runs out.
 
         Raises:
             UnknownNameError, LimitError, SafetyError, CollisionError: as `move`.
@@ -336,13 +341,13 @@ class ScannerTwin:
         return self._stopped(self._lookahead(now).stopped())
 
     def estop(self, now: float, by: str = "") -> StopMotion:
-        """Stop the motors as the machine's stop category says; switch X-rays off.
+        """Stop the motors by the machine's stop category; switch X-rays off.
 
         Motion and X-rays are rejected until a reset.
 
         Args:
             now: time of the command [s].
-            by: who pressed it.
+            by: connection that pressed it.
         """
         self.tube = switched(self.machine, self.tube, False, now, warm=True)
         self.safety = rules.estopped(self.safety, by)
@@ -361,7 +366,7 @@ class ScannerTwin:
 
         Args:
             now: time of the command [s].
-            stop: `Safety.stop` as whoever asks has seen it; None releases whichever stop
+            stop: `Safety.stop` as the requester knows it; None releases whichever stop
                 it is.
 
         Raises:
@@ -383,7 +388,8 @@ class ScannerTwin:
         self._take({name: motion.at_rest(x, now) for name, x in stand.items()})
         self.safety = in_contact(self.safety, self._touching(now))
 
-    # Programmes ---------------------------------------------------------------------------------
+    # Programmes
+    # ---------------------------------------------------------------------------------
 
     def prepared(
         self,
@@ -391,14 +397,14 @@ class ScannerTwin:
         now: float,
         start: Mapping[str, float] | None = None,
     ) -> UnsweptProgramme:
-        """Prepare a programme for its sweep; `certified` on the result may run in another
-        thread.
+        """Prepare a programme for its sweep; `certified` on the result may run
+        in another thread.
 
         Args:
             programme: motor -> trajectories in the order of their starts, on a clock that
                 shows 0 when it is taken over.
             now: time of the command [s].
-            start: where motors will stand then, at rest; those left out where their
+            start: positions of motors then, at rest; those left out where their
                 programme ends [mm, deg].
 
         Raises:
@@ -441,7 +447,8 @@ class ScannerTwin:
         for name, legs in prepared.legs.items():
             self._drives[name] = self._drives[name].following(*legs, origin=now)
 
-    # The stage ----------------------------------------------------------------------------------
+    # The stage
+    # ----------------------------------------------------------------------------------
 
     def stage_change(
         self,
@@ -458,8 +465,8 @@ class ScannerTwin:
         `certified` on it may run in another thread; then `take_stage` puts it in force.
 
         Args:
-            sample: what is to stand on the stage.
-            correction: what is to be in force; None for none.
+            sample: the sample to be on the stage.
+            correction: the correction to be in force; None for none.
             guard: finds contacts with both of them.
             now: time of the command [s].
             targets: where motors are sent together with the change; None sends none.
@@ -486,8 +493,8 @@ class ScannerTwin:
         )
 
     def take_stage(self, change: StageChange, now: float) -> CollisionError | None:
-        """Put a certified change of the stage in force: sample, correction, guard, paces
-        and moves.
+        """Put a certified change of the stage in force: sample, correction, guard,
+        paces and moves.
 
         What is under way is judged anew where it has changed meanwhile. Motion that is
         not free of the new stage is halted, if halting is free. Moves of the change
@@ -549,7 +556,7 @@ class ScannerTwin:
             now: time [s].
 
         Returns:
-            Messages about what touches; the state is blocked then.
+            Messages about touching parts; the state is blocked then.
 
         Raises:
             GeometryError: a correction that no scanner can have.
@@ -570,7 +577,8 @@ class ScannerTwin:
         """
         require_applicable(self.machine, self.profile, self.camera, correction)
 
-    # Settings -----------------------------------------------------------------------------------
+    # Settings
+    # -----------------------------------------------------------------------------------
 
     def set_axis(
         self, axis: str, *, speed: float | None = None, acceleration: float | None = None
@@ -596,8 +604,10 @@ class ScannerTwin:
         Args:
             kV, power_W: settings.
             on: X-rays on or off.
-            now: time of the switch [s]; None is long ago, so that X-rays are ready at once.
-            warm: leave out the warm-up after a long rest (scripts are planned without one).
+            now: time of the switch [s]; None is long ago, so that X-rays are ready at
+                once.
+            warm: leave out the warm-up after a long rest (scripts are planned without
+                one).
 
         Raises:
             LimitError: outside the tube's range.
@@ -617,11 +627,12 @@ class ScannerTwin:
         """Change the camera's settings; those left out stay.
 
         Raises:
-            LimitError: outside what the detector allows.
+            LimitError: outside the detector's range.
         """
         self.camera = changed_camera(self.machine.detector, self.camera, change)
 
-    # Inside -------------------------------------------------------------------------------------
+    # Inside
+    # -------------------------------------------------------------------------------------
 
     def _take(self, trajectories: Mapping[str, Trajectory]) -> None:
         """Replace the programmes of motors; the caller holds a certificate for it."""

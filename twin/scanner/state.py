@@ -1,12 +1,14 @@
-"""The values that describe a scanner at one moment: plain, frozen, comparable; and their changes.
+"""The values that describe a scanner at one moment: plain, frozen, comparable;
+and their changes.
 
-They describe tube, sample, safety state and the whole scanner. `scanner.ScannerTwin`, the one
-mutable object, returns them. A hidden misalignment is never part of them. Settings of tube and
-camera change by pure functions, old value and request to new value, which raise without a change.
+They describe tube, sample, safety state and the scanner. `scanner.ScannerTwin`, the one
+mutable object, returns them. A hidden misalignment is never part of them. Settings of
+tube and camera change by pure functions, old value and request to new value, which raise
+without a change.
 
-`readout` is derived geometry: distances, magnification, voxel size, field of view, piercing point.
-Everything is computed from nominal poses and an optional correction. Voxel size is pixel * SOD /
-SDD (the thesis's formula has the ratio upside down).
+`readout` is derived geometry: distances, magnification, voxel size, field of view,
+piercing point. Everything is computed from nominal poses and an optional correction.
+Voxel size is pixel * SOD / SDD (the thesis's formula has the ratio upside down).
 """
 
 from __future__ import annotations
@@ -53,7 +55,8 @@ class TubeSettings:
     Attributes:
         kV, power_W: settings.
         on: high voltage is on; the image stays dark until X-rays are ready.
-        since: time of the last switch [s]; a twin begins with a tube that was in use till then.
+        since: time of the last switch [s]; a twin begins with a tube that was in use till
+            then.
         ready_at: time from which X-rays are stable, while on [s].
     """
 
@@ -78,8 +81,8 @@ class TubeSettings:
 class StagePlacement:
     """Placement of the sample on the stage: shift [mm], then turns about x, y, z [deg].
 
-    A point p of the sample lies at R_z R_y R_x p + (x, y, z) in the object's frame; all turns are
-    right-handed (the order is assumed).
+    A point p of the sample is at R_z R_y R_x p + (x, y, z) in the object's frame; all
+    turns are right-handed (the order is assumed).
     """
 
     x: float = 0.0
@@ -103,8 +106,8 @@ class StagePlacement:
         return turned
 
     def to_sample(self, cone_vec: ConeVec) -> ConeVec:
-        """Transform a geometry of the object's frame to the sample's own frame (for the
-        projector)."""
+        """Transform a geometry of the object's frame to the sample's own frame
+        (for the projector)."""
         if self == StagePlacement():
             return cone_vec
         back = self.rotation.T
@@ -129,8 +132,8 @@ class NamedCorrection:
         date: ISO 8601.
         parameters: the offsets [mm, rad].
         note: its origin (data set, phantom, residual).
-        panel: the distortion that was found along with it; None: none. It is undone in images, and
-            no state of the twin has it.
+        panel: the distortion that was found along with it; None: none. It is undone in
+            images, and no state of the twin has it.
     """
 
     name: str
@@ -161,9 +164,10 @@ class Safety:
         max_blocked_attempts: at so many the state becomes blocked.
         reason: why it is not ready, as a message.
         stop: number of the latest E-stop or block; each has the next one.
-        stopped_by: who pressed the E-stop in force; "" where nobody did or nobody knows.
-        contact: two parts that touch, or are closer than the safety margin; a reset does not end
-            that, and only motions that bring no such pair nearer are allowed.
+        stopped_by: connection that pressed the E-stop in force; "" if there is none or it
+            is unknown.
+        contact: two parts that touch, or are closer than the safety margin; a reset does
+            not end that, and only motions that bring no such pair nearer are allowed.
     """
 
     state: SafetyName = "ready"
@@ -177,7 +181,8 @@ class Safety:
 
 @dataclass(frozen=True)
 class Readout:
-    """Derived quantities of one geometry, as scanners show them; the fields are those of the wire.
+    """Derived quantities of one geometry, as scanners show them; the fields are
+    those of the wire.
 
     Attributes:
         SOD_mm: source-object distance along the beam.
@@ -185,7 +190,8 @@ class Readout:
         magnification: SDD / SOD.
         voxel_size_mm: binned pixel pitch * SOD / SDD.
         field_of_view_mm: (width, height) of the image, scaled back to the rotation axis.
-        piercing_point_px: (column, row) of the foot of the perpendicular from the focal spot.
+        piercing_point_px: (column, row) of the foot of the perpendicular from the focal
+            spot.
         cone_angle_deg: full vertical opening angle.
         axis_column_px: column of the rotation axis at the height of the focal spot.
     """
@@ -287,7 +293,7 @@ def switched(
     """Switch the tube on or off.
 
     Args:
-        machine: says how long the high voltage takes, and a warm-up after a long rest.
+        machine: has the times of the high voltage, and of a warm-up after a long rest.
         tube: before; switching to its present state changes nothing.
         on: on or off.
         now: time of the command [s]; None: the X-rays are ready already.
@@ -333,7 +339,7 @@ def changed_camera(
     """Change settings of a camera; those left out stay.
 
     Raises:
-        LimitError: outside what the detector allows; the message names the setting.
+        LimitError: outside the detector's range. the message names the setting.
     """
     stated: dict[str, Any] = {name: x for name, x in change.items() if x is not None}
     new = replace(camera, **stated)
@@ -357,7 +363,8 @@ def _require_within(device: str, name: str, value: float, lower: float, upper: f
 def require_applicable(
     machine: Machine, profile: Profile, camera: CameraSettings, correction: NamedCorrection | None
 ) -> None:
-    """Check that a correction leaves a geometry that a scanner can have, anywhere in the travel.
+    """Check that a correction leaves a geometry that a scanner can have, anywhere
+    in the travel.
 
     Raises:
         GeometryError: it does not; the message names the offset or the check.

@@ -1,7 +1,8 @@
 """The commands of an Acquila script as frozen values, one type for each.
 
-A command holds its arguments and its place in the text; it does not depend on a machine. Units are
-the script's: mm, deg, ms, kV, W. `parse` reads commands, `simulated_script` simulates them.
+A command holds its arguments and its place in the text; it does not depend on a machine.
+Units are the script's: mm, deg, ms, kV, W. `parse` reads commands, `simulated_script`
+simulates them.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ Binary = Annotated[
 ]
 """Bytes; base64 in JSON."""
 ImageKind = Literal["dark", "flat", "projection", "preview"]
-"""What an image is for."""
+"""Purpose of an image."""
 
 
 class Wait(Enum):
@@ -45,7 +46,7 @@ class Wait(Enum):
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 @dataclass(frozen=True, kw_only=True)
 class Command:
-    """What all commands have: place in the text (from 1), wait, and the two optional times.
+    """Fields of all commands: place in the text (from 1), wait, and the two optional times.
 
     Each class below it is a frozen dataclass too, whose fields are given by name.
     """
@@ -62,8 +63,8 @@ class Command:
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """Fields of the command's own type, by name; those that all commands have are
-        left out."""
+        """Fields of the command's own type, by name; those that all commands have
+        are left out."""
         return {f.name: getattr(self, f.name) for f in fields(self)[len(fields(Command)) :]}
 
 
@@ -80,7 +81,7 @@ class SetOutputPath(Command):
 
 
 class SetSampleInfo(Command):
-    """`scanner set sample info`; `data` are the argument's bytes as they stand in the file."""
+    """`scanner set sample info`; `data` are the argument's bytes as in the file."""
 
     data: Binary
 
@@ -92,7 +93,8 @@ class KeepXrayOn(Command):
 
 
 class WriteSettingsFile(Command):
-    """`scanner write settings file`: motor readings of this moment go to `scan settings.txt`."""
+    """`scanner write settings file`: motor readings of this moment go
+    to `scan settings.txt`."""
 
 
 class XrayOn(Command):
@@ -219,7 +221,7 @@ def _to_json(command: Command) -> dict[str, Any]:
 
 
 def _from_json(value: Any) -> Command:
-    """Read a command back from what `_to_json` wrote; a Command passes unchanged."""
+    """Read a command back from the form of `_to_json`; a Command passes unchanged."""
     if isinstance(value, Command):
         return value
     fields = dict(value)
@@ -242,7 +244,7 @@ class Script:
 
     Attributes:
         commands: in the order of the text.
-        warnings: what reading found worth saying; errors are never in here.
+        warnings: findings that are not errors; errors are never in here.
         lines: number of lines of the text.
     """
 

@@ -1,10 +1,10 @@
 """Compose an Acquila script from a request: distances, frames, exposure, positions.
 
-The text has the scanner's own form (TAB separated, seven columns, CRLF) and follows the smooth-scan
-rule: image i of n is taken at i * 360 / (n - 1) after the trigger, and the run-up holds the
-acceleration and four images. `motor_targets` brings source, detector and sample to
-the beam's middle. Where no motor moves source or detector, the sample moves instead. The result is
-checked by planning it.
+The text has the scanner's own form (TAB separated, seven columns, CRLF) and follows the
+smooth-scan rule: image i of n is taken at i * 360 / (n - 1) after the trigger, and the
+run-up holds the acceleration and four images. `motor_targets` brings source, detector and
+sample to the beam's middle. Where no motor moves source or detector, the sample moves
+instead. The result is checked by planning it.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> 
 
     Raises:
         LimitError: a count, distance or speed that the machine does not allow, or a
-            motion for which it has no motor; says which.
+            motion for which it has no motor; names the one.
 
     Returns:
         TAB separated lines with CRLF, as `parse_script` reads them.
@@ -95,8 +95,8 @@ def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> 
 
 
 def _usual(request: ScanRequest, places: MotorTargets) -> Iterator[tuple[float, float, float]]:
-    """Yield SOD, SDD and height to try: as requested, else the usual ones, else those at
-    home [mm]."""
+    """Yield SOD, SDD and height to try: as requested, else the usual ones, else
+    those at home [mm]."""
 
     def tried(asked: float | None, *usual: float) -> Iterable[float]:
         if asked is None:
@@ -273,16 +273,16 @@ class _Writer(MotorTargets):
         yield from self.drive(name, rotation.speed, rotation.acceleration)
 
     def turn(self, total: float, frames: int, first: int) -> Iterator[str]:
-        """Yield a smooth scan of `frames` images over `total` degrees from angle 0, and
-        its run-up."""
+        """Yield a smooth scan of `frames` images over `total` degrees from angle 0,
+        and its run-up."""
         name, rotation = self.rotation
         yield from self.run_up(total, frames)
         yield from self.sweep(total, frames, first)
         yield from self.drive(name, rotation.speed, rotation.acceleration)
 
     def run_up(self, total: float, frames: int) -> Iterator[str]:
-        """Yield the move to the start of the run-up, the scan's speed and its numbers of
-        images."""
+        """Yield the move to the start of the run-up, the scan's speed and its
+        numbers of images."""
         name, rotation = self.rotation
         yield from self.drive(name, rotation.speed, rotation.acceleration)
         yield _row(name, "move absolute", _f(-self.run_up_deg(total, frames)))
@@ -345,7 +345,7 @@ class _Writer(MotorTargets):
             Motor -> target [mm, deg], within its travel.
 
         Raises:
-            LimitError: beyond a travel limit, or motors do not set what is requested.
+            LimitError: beyond a travel limit, or a quantity that no motor sets.
         """
         w = self.request
         height = w.height_mm
@@ -360,7 +360,8 @@ class _Writer(MotorTargets):
         }
         if not self.has("source_z"):
             wanted["object_z"] = height  # the sample's middle into the beam
-        # Where no motor brings the region into the beam's middle, the sample goes to the region.
+        # Where no motor brings the region into the beam's middle, the sample goes to the
+        # region.
         for across, k in (("x", 0), ("z", 2)):
             if not self.has(f"detector_{across}") and f"object_{across}" in self.drivers:
                 wanted[f"object_{across}"] += self.region[k] * sod / w.sdd_mm
@@ -368,7 +369,7 @@ class _Writer(MotorTargets):
         rows, cols = self.camera.shape
         pixel, row_pixel = self.camera.pixels_mm(self.machine.detector.pixels)
         if not self.has("detector_x"):
-            wanted["detector_x"] = 0.0  # the region lies where it lies
+            wanted["detector_x"] = 0.0  # the region stays where it is
         if not self.has("detector_z"):
             wanted["detector_z"] = height
         for quantity, asked in wanted.items():
@@ -388,8 +389,8 @@ class _Writer(MotorTargets):
         return {name: check_target(self.machine, name, value) for name, value in found.items()}
 
     def out_of_beam(self) -> dict[str, float]:
-        """Compute the stage's targets for the flat image: beside the beam, to the freer
-        side."""
+        """Compute the stage's targets for the flat image: beside the beam, to
+        the freer side."""
         station = self.station(self.request.sod_mm)
         return beside_beam(self.machine, self.profile, self.camera, station)[0]
 
@@ -424,8 +425,8 @@ class _Writer(MotorTargets):
 
     @property
     def region(self) -> FloatArray:
-        """Middle of the camera's region relative to the panel's middle, world frame (3,)
-        [mm]."""
+        """Middle of the camera's region relative to the panel's middle, world
+        frame (3,) [mm]."""
         across, down = self.camera.roi_shift_mm(self.machine.detector.pixels)
         u, v = turn_detector(
             COLUMN_DIRECTION, ROW_DIRECTION, 0.0, 0.0, math.radians(self.profile.det_roll_deg)

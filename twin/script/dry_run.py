@@ -1,8 +1,8 @@
 """The dry run: parse, plan and check a script without a server, as one report.
 
-The report has everything a user wants to know before touching the scanner: problems with their
-lines, time (computed and assumed), frames, bytes, dose-relevant exposure, what the beam sees and,
-through a function passed as an argument, collisions and clearances.
+The report has everything a user wants to know before touching the scanner: problems with
+their lines, time (computed and assumed), frames, bytes, dose-relevant exposure, the
+beam's view and, through a function passed as an argument, collisions and clearances.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ def check_script(
     collision: CollisionCheck | None = None,
     physics: Physics = "poly",
 ) -> CheckReport:
-    r"""Parse, plan and check a script; what cannot be read is reported and the rest is planned.
+    r"""Parse, plan and check a script; unreadable lines are reported and the rest is planned.
 
     Args:
         text: the script's text, bytes or path; or a script from `parse_script`.
         machine: on which it would run; the FleX-ray if None.
         profile: zero offsets in force; the machine's default if None.
-        start: the scanner before it; None assumes the machine's homes, and the report
-            says so.
-        sample: its size, for truncation; None takes what the script says, if anything.
+        start: the scanner before it; None assumes the machine's homes, which the report
+            states.
+        sample: its size, for truncation; None takes the script's own, if any.
         collision: finds collisions and clearances over a plan; None leaves them
             unchecked.
         physics: predicts whether the open beam saturates the panel.
@@ -85,7 +85,7 @@ def check_plan(
 
     Args:
         plan: of a script or of poses.
-        problems: of the text that it was made from, beside its own.
+        problems: of the text that it was made from, in addition to its own.
         collision: see `check_script`.
         text: that it was made from, for the page.
         start_known: whether the start was given.
@@ -128,8 +128,7 @@ def _start_problems(plan: ScanPlan) -> list[ScriptProblem]:
 
 
 def _optics(view: View) -> Optics:
-    """Describe what the images of a view show: distances, magnification, field and
-    truncation."""
+    """Describe the images of a view: distances, magnification, field and truncation."""
     p = view.poses
     camera = view.camera
     rows, cols = shape = camera.shape

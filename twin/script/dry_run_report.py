@@ -1,4 +1,5 @@
-"""The figures of a dry run in words, for people: the command line and the page show the same."""
+"""The figures of a dry run in words, for people: the command line and the page
+show the same."""
 
 from __future__ import annotations
 
@@ -18,7 +19,7 @@ def html_report(report: CheckReport, name: str = "script") -> str:
 
     Args:
         report: from `check_script`.
-        name: what to call the script.
+        name: title of the script.
     """
     return str(backend("dry-run pages").html_report(report, name))
 

@@ -1,8 +1,9 @@
-"""Executed scripts: what the scanner's software writes after it ran one, a log of the scan.
+"""Executed scripts: logs that the scanner's software writes after it ran one.
 
-A line has ten TAB separated columns: the seven of the script, then the command's own time [ms], its
-reply, which may be binary and hold TABs and line ends, and the moment it was sent (hh:mm:ss.mmm).
-So a line ends at its stamp. The form is known from one published log (`docs/machine-fit.md`).
+A line has ten TAB separated columns: the seven of the script, then the command's own time
+[ms], its reply, which may be binary and hold TABs and line ends, and the moment it was
+sent (hh:mm:ss.mmm). So a line ends at its stamp. The form is known from one published log
+(`docs/machine-fit.md`).
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ _REPLY_BYTES: Final = 267
 class MotorReply:
     """A motor's answer to a move [mm or deg, s], in the axis's own sign.
 
-    Decoded by agreement with the settings file of the same scan; nobody has documented it.
+    Decoded by agreement with the settings file of the same scan; there is no
+    documentation.
     """
 
     position: float
@@ -52,7 +54,7 @@ class MotorReply:
 
 @dataclass(frozen=True)
 class Executed:
-    """One line of a log: the command, how long it took, and what it answered.
+    """One line of a log: the command, its duration and its answer.
 
     Attributes:
         command: as a script has it; its line counts the lines of the script.
@@ -222,7 +224,7 @@ def motor_reply(reply: bytes) -> MotorReply | None:
     Args:
         reply: column 9: 17 big-endian doubles (0 position, 1 target, 2 speed, 4
             acceleration, 5 upper and 6 lower limit, 8 greatest speed, 10 greatest
-            acceleration), then others, the two limits among them once more.
+            acceleration), then others, which repeat the two limits.
     """
     if len(reply) < _LIMITS_COPY_BYTE + 16:
         return None

@@ -1,10 +1,12 @@
 """The vocabulary of Acquila scripts: the commands of each component, and their arguments.
 
-One table serves all components; each command has one function that turns argument text into the
-command's own fields or raises `ArgumentError`. `describe` gives each command one readable line.
+One table serves all components; each command has one function that turns argument text
+into the command's own fields or raises `ArgumentError`. `describe` gives each command one
+readable line.
 
-A path in a script names a file inside the data set's folder and nothing else: drives, folders and
-characters that some file system does not allow are dropped, and the file's name is left.
+A path in a script names a file inside the data set's folder and nothing else: drives,
+folders and characters that some file system does not allow are dropped, and the file's
+name is left.
 """
 
 from __future__ import annotations
@@ -44,7 +46,8 @@ _GOES_ON: Final[Mapping[c.Wait, str]] = {
 
 
 class ArgumentError(ValueError):
-    """An argument that does not read; `code` and `index` (0 or 1) say what and which."""
+    """An argument that does not read; `code` names the problem and `index` (0
+    or 1) the argument."""
 
     def __init__(self, message: str, code: str = "value", index: int = 0) -> None:
         super().__init__(message)
@@ -56,8 +59,8 @@ class ArgumentError(ValueError):
 class Spec:
     """How a command is read: its type, its reader, and how many arguments it takes at most.
 
-    `free` marks a first argument that may hold spaces, so that in the space-padded form it takes
-    all words but a number that belongs to a second argument.
+    `free` marks a first argument that may hold spaces, so that in the space-padded form
+    it takes all words but a number that belongs to a second argument.
     """
 
     type: type[c.Command]
@@ -252,8 +255,8 @@ def vocabulary(component: str) -> tuple[str, ...]:
 
 
 def find(component: str, command: str) -> Spec | None:
-    """Look up the command of `component`, case and blanks aside; motors share one
-    vocabulary."""
+    """Look up the command of `component`, case and blanks aside; motors
+    share one vocabulary."""
     table = _BY_KEY.get(component.lower()) or _BY_KEY[""]
     spec = table.get(command.lower())
     if spec is not None:
@@ -275,8 +278,8 @@ def match(component: str, words: list[str]) -> tuple[Spec, int] | None:
 
 
 def bare_name(path: str) -> str:
-    r"""Return the last part of `path` (after \ or /), unsafe characters as `_`; may be
-    empty."""
+    r"""Return the last part of `path` (after \ or /), unsafe characters as `_`;
+    may be empty."""
     name = re.split(r"[\\/]", path)[-1]
     name = _UNSAFE.sub("_", name).strip(" .")[:MAX_NAME_CHARS]
     if _DEVICE.fullmatch(name):

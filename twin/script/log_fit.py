@@ -1,21 +1,23 @@
-"""A machine fitted to executed scripts: limits and rates from motors' replies, times of commands.
+"""A machine fitted to executed scripts: limits and rates from motors' replies,
+times of commands.
 
-The time of a command beyond its motion, pause or exposures is the median over its kind. Its 90 %
-range is about the next time. From 19 times on it is that of order statistics (Wilks 1941,
-doi:10.1214/aoms/1177731788), whatever the times are distributed like: the next one is as likely in
-each of the n + 1 gaps between and beyond those that were measured. Of fewer times, 1 / (n + 1) is
-more than 5 % at each end, and the range reaches beyond the least and the greatest. How far, an
-exponential tail in the logarithm says, whose scale is the kind's mean absolute deviation, into
-which that of all kinds enters as `BORROWED_TIMES` times (a variance moderated by those of all
-groups, Smyth 2004, doi:10.2202/1544-6115.1027); so a kind that was seen once has a range, too. The
-extremes of one or two times need not lie in the tails: the root of 1 + 1/n^2 makes up for that, to
-2 % of what a Laplace distribution needs.
+The time of a command beyond its motion, pause or exposures is the median over its kind.
+Its 90 % range is about the next time. From 19 times on it is that of order statistics
+(Wilks 1941, doi:10.1214/aoms/1177731788), whatever the times are distributed like: the
+next one is as likely in each of the n + 1 gaps between and beyond those that were
+measured. Of fewer times, 1 / (n + 1) is more than 5 % at each end, and the range reaches
+beyond the least and the greatest. The distance is that of an exponential tail in the
+logarithm, whose scale is the kind's mean absolute deviation, into which that of all kinds
+enters as `BORROWED_TIMES` times (a variance moderated by those of all groups, Smyth 2004,
+doi:10.2202/1544-6115.1027); so a kind that was seen once has a range, too. The extremes
+of one or two times need not be in the tails: the root of 1 + 1/n^2 corrects for that,
+within 2 % of the value for a Laplace distribution.
 
-What the kinds have in common is drift: the logarithms of the later half of a kind's times over the
-median of the earlier half (a split in time, Tashman 2000, doi:10.1016/S0169-2070(00)00065-0), over
-the root of 1 + 1/n, as for a mean of n. It goes on until the next scan. Ranges reach so much
-further, as far as the kinds agree on it (James and Stein 1961); in a total it is common to all
-lines.
+All kinds have drift in common: the logarithms of the later half of a kind's times over
+the median of the earlier half (a split in time, Tashman 2000,
+doi:10.1016/S0169-2070(00)00065-0), over the root of 1 + 1/n, as for a mean of n. It goes
+on until the next scan. Ranges reach so much further, as far as the kinds agree on it
+(James and Stein 1961); in a total it is common to all lines.
 """
 
 from __future__ import annotations
@@ -48,7 +50,7 @@ _LOG_OFFSET_S: Final = 0.003
 RESOLUTION_S: Final = 0.001
 """Resolution of own times in column 8 [s]."""
 _MAX_READY_WAIT_S: Final = 0.05
-"""Longest wait for X-rays that were ready already [s]; it tells no warm-up time."""
+"""Longest wait for X-rays that were ready already [s]; it contains no warm-up time."""
 _TIME_DECIMALS: Final = 4
 """Number of decimals of times in the machine file."""
 
@@ -131,8 +133,8 @@ class LogRow:
 
     @property
     def inside(self) -> bool | None:
-        """Whether the real time is in the 90 % range, to the log's resolution; None
-        without one."""
+        """Whether the real time is in the 90 % range, to the log's resolution;
+        None without one."""
         if self.p5_s is None or self.p95_s is None:
             return None
         half = 0.5 * RESOLUTION_S + 1e-9
@@ -150,7 +152,7 @@ class LogComparison:
     Attributes:
         machine: that predicts.
         rows: in the log's order.
-        problems: warnings of what tells that the log is of another machine.
+        problems: warnings that the log is of another machine.
     """
 
     machine: Machine
@@ -237,11 +239,12 @@ def fit_machine(logs: Sequence[Log], base: Machine, source: str) -> Fit:
 
     Args:
         logs: lines of each log, from `read_log`, the oldest first.
-        base: what the logs do not say.
+        base: source of everything that the logs do not contain.
         source: names the logs, for the machine file.
 
     Raises:
-        MachineFileError: no line at all, or an axis's replies do not fit the base machine.
+        MachineFileError: no line at all, or an axis's replies do not fit the base
+            machine.
 
     Returns:
         The machine, and how it agrees with the logs.
@@ -383,7 +386,7 @@ def _samples(logs: Sequence[Log], machine: Machine) -> dict[str, tuple[float, ..
                 took = since if x.own_s > _MAX_READY_WAIT_S else math.nan
             elif isinstance(command, c.XrayOn):
                 since = 0.0
-            # Where an axis stood before its first move nobody knows.
+            # An axis's place before its first move is unknown.
             if command.wait is c.Wait.ACK and not first and math.isfinite(took):
                 found.setdefault(kind, []).append(took)
     return {kind: tuple(times) for kind, times in found.items()}
@@ -430,8 +433,8 @@ def _log(time: float) -> float:
 
 
 def _later(times: Times) -> list[float]:
-    """Return the logarithms of the later half's times over the earlier half's median,
-    scaled."""
+    """Return the logarithms of the later half's times over the earlier
+    half's median, scaled."""
     half = (len(times) + 1) // 2
     middle = _log(median(times[:half]))
     scale = math.sqrt(1.0 + 1.0 / half)

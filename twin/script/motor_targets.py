@@ -1,7 +1,7 @@
 """Where a machine's motors bring source, sample and detector, and out of the beam.
 
-Targets follow from the machine's linear map and the profile's offsets. A motor that moves two of
-these things can set one of them only.
+Targets follow from the machine's linear map and the profile's offsets. A motor that moves
+two of these things can set one of them only.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.machine.kinematics import motor_poses
 
 BESIDE_BEAM_MM: Final = 60.0
-"""Distance of the sample from the field of view in the flat image [mm] (assumed: any
-sample)."""
+"""Distance of the sample from the field of view in the flat image [mm]
+(assumed: any sample)."""
 
 
 QUANTITIES: Final = {
@@ -32,7 +32,7 @@ QUANTITIES: Final = {
     "source_x": "the source sideways",
     "object_z": "the height of the sample",
 }
-"""What motors set, the most important first."""
+"""Quantities that motors set, the most important first."""
 
 
 @dataclass(frozen=True)
@@ -115,14 +115,14 @@ class MotorTargets:
         """Check that motors move a quantity.
 
         Raises:
-            LimitError: what cannot be done, and which quantity no motor moves.
+            LimitError: names the quantity that no motor moves, and the purpose.
         """
         if not self.has(quantity):
             none = f"has no motor for {QUANTITIES[quantity]}, which {what} needs"
             raise self.lacking(none, asked=what, missing=quantity)
 
     def lacking(self, what: str, **data: object) -> LimitError:
-        """Make the error that says what this machine lacks."""
+        """Make the error for a motor that this machine lacks."""
         return LimitError(f"{self.machine.name} {what}", data)
 
     @property
@@ -144,7 +144,7 @@ def beside_beam(
         machine: whose motors these are.
         profile: zero offsets.
         camera: decides how wide the beam is that reaches the image.
-        positions: motors [mm, deg]; those left out stand at home.
+        positions: motors [mm, deg]; those left out are at home.
         radius_mm: of the sample, if known.
 
     Returns:

@@ -1,13 +1,14 @@
-"""Text or bytes of an Acquila script to typed commands; every problem is reported, not the first.
+"""Text or bytes of an Acquila script to typed commands; every problem is reported,
+not the first.
 
-`read_script` returns all commands that could be read and all problems; `parse_script` raises if
-there is an error. Limits and axes are checked when the script is planned.
+`read_script` returns all commands that could be read and all problems; `parse_script`
+raises if there is an error. Limits and axes are checked when the script is planned.
 
 Two forms are read, line by line, so that a file may mix them: seven TAB separated columns
-(component, command, argument 1, argument 2, wait, timeout in ms, expected duration in ms) and the
-same columns padded with spaces. Bytes are decoded as UTF-8 with undecodable bytes kept, so a
-binary argument survives unchanged. One command is treated specially: `set sample info` carries
-binary data in which TAB, CR and LF may be part of the argument.
+(component, command, argument 1, argument 2, wait, timeout in ms, expected duration in ms)
+and the same columns padded with spaces. Bytes are decoded as UTF-8 with undecodable bytes
+kept, so a binary argument survives unchanged. One command is treated specially: `set
+sample info` carries binary data in which TAB, CR and LF may be part of the argument.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ class CodeLine:
 
     Attributes:
         line: number, from 1.
-        text: the whole line without its end.
+        text: the line without its end.
         columns: the TAB separated fields, blanks stripped; None in the space-padded form.
     """
 
@@ -77,8 +78,8 @@ class CodeLine:
 
 
 def decode(data: str | bytes) -> str:
-    """Decode a script's bytes; those that are not UTF-8 become lone surrogates (`encode`
-    undoes it)."""
+    """Decode a script's bytes; those that are not UTF-8 become lone surrogates
+    (`encode` undoes it)."""
     text = data.decode("utf-8", "surrogateescape") if isinstance(data, bytes) else data
     return text.removeprefix("\ufeff")
 
@@ -194,8 +195,8 @@ def _blob_columns(text: str) -> tuple[Field, ...]:
 
 
 def _field(piece: str, start: int, *, keep: bool = False) -> Field:
-    """Make a field with blanks stripped, unless `keep`; `start` is the index of its first
-    character."""
+    """Make a field with blanks stripped, unless `keep`; `start` is the index of
+    its first character."""
     if keep or not piece:
         return Field(piece, start + 1)
     stripped = piece.strip(_BLANK)
@@ -212,7 +213,8 @@ def parse_script(text: Source) -> c.Script:
     """Read a script in either of its two forms.
 
     Args:
-        text: the file's text or, so that binary arguments survive, its bytes, or its path.
+        text: the file's text or, so that binary arguments survive, its bytes, or its
+            path.
 
     Raises:
         ScriptError: has all errors (and warnings), with line and column.
@@ -260,8 +262,8 @@ def read_script(text: Source) -> tuple[c.Script, tuple[ScriptProblem, ...]]:
 
 
 def read_row(row: CodeLine, problems: list[ScriptProblem]) -> c.Command | None:
-    """Read the command of one row; add its problems to `problems` and return None after
-    an error."""
+    """Read the command of one row; add its problems to `problems` and return None
+    after an error."""
     return _Line(row, problems).command()
 
 
@@ -295,7 +297,7 @@ class _Refused(Exception):
 
 
 class _Line:
-    """Reads one row and notes what is wrong with it."""
+    """Reads one row and reports its problems."""
 
     def __init__(self, row: CodeLine, problems: list[ScriptProblem]) -> None:
         self.row = row
@@ -359,7 +361,7 @@ class _Line:
         if width:
             wait = Field(" ".join(w.text for w in words[at : at + width]), words[at].column)
         tail = _until_comment(words[at + width : at + width + 3])[:2]
-        # One number after the wait stands where the TAB form has the expected duration.
+        # One number after the wait is in the place of the TAB form's expected duration.
         timeout, expected = tail if len(tail) == 2 else (self.end, *tail, self.end)[:2]
         first, second = self._arguments(spec, words[start:at])
         return _Parts(spec, first, second, wait, timeout, expected)

@@ -1,7 +1,7 @@
-"""What can be wrong with a script, as values: severity, code, place, message.
+"""Problems of a script, as values: severity, code, place, message.
 
-Every reader of a script collects problems and continues, so that all are reported at once.
-`ScriptError` carries them for callers that need a correct script.
+Every reader of a script collects problems and continues, so that all are reported at
+once. `ScriptError` carries them for callers that need a correct script.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ Severity = Literal["error", "warning"]
 
 @dataclass(frozen=True)
 class ScriptProblem:
-    """One finding. `line` and `column` count from 1; line 0 is the script as a whole."""
+    """One finding. `line` and `column` count from 1; line 0 is the entire script."""
 
     severity: Severity
     code: str

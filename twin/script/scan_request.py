@@ -17,7 +17,8 @@ REFERENCES: Final = 10
 
 @dataclass(frozen=True)
 class ScanPosition:
-    """The sample's position in one scan of a calibration series: SOD and lateral offset [mm]."""
+    """The sample's position in one scan of a calibration series: SOD and
+    lateral offset [mm]."""
 
     sod_mm: float
     lateral_mm: float = 0.0
@@ -28,18 +29,19 @@ class ScanRequest:
     """The scan to compose a script for, in the edge's units.
 
     Attributes:
-        kind: fly (one smooth turn), step (stop for every image), tiled (fly scans with the detector
-            side by side), helical (several turns while source and detector rise), calibration (one
-            fly scan for each of `placements`).
-        sod_mm, sdd_mm: source-object and source-detector distance; None is 600 and 1059 where the
-            machine gets there, else its home, or its only one.
+        kind: fly (one smooth turn), step (stop for every image), tiled (fly scans with
+            the detector side by side), helical (several turns while source and detector
+            rise), calibration (one fly scan for each of `placements`).
+        sod_mm, sdd_mm: source-object and source-detector distance; None is 600 and 1059
+            where the machine gets there, else its home, or its only one.
         frames: images of one fly scan, of the whole for step and helical.
         exposure_ms, averages: of one image; None is the machine's exposure.
-        height_mm: of source and detector centre above the origin; None is the sample's, or as for
-            sod_mm.
+        height_mm: of source and detector centre above the origin; None is the sample's,
+            or as for sod_mm.
         turns, rise_mm: of a helical scan, in total.
         tiles: side by side, for tiled; neighbours share a tenth of the columns.
-        placements: for calibration; None is SOD 600 and 800, or what the machine has room for.
+        placements: for calibration; None is SOD 600 and 800, or as many as the machine
+            has room for.
         mode, roi: camera; None is the machine's.
         kV, power_W: tube; None is the machine's.
         darks, flats: averages of the dark and of the flat image.

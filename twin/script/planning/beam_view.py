@@ -1,8 +1,8 @@
-"""What the beam sees of the sample in the images of a plan, and warnings about it.
+"""The beam's view of the sample in the images of a plan, and warnings about it.
 
-Poses come from the nominal geometry. The sample is a cylinder about the rotation axis, or only the
-axis where its size is unknown, so a report about truncation is about the cylinder that holds the
-sample at every angle of a full rotation.
+Poses come from the nominal geometry. The sample is a cylinder about the rotation axis, or
+only the axis where its size is unknown, so a report about truncation is about the
+cylinder that holds the sample at every angle of a full rotation.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ class View:
     """Images of one camera setting and kind, and the sample's projection in them [pixels].
 
     Attributes:
-        left, right: columns of the projection's edges, (n,); equal where the size is unknown.
+        left, right: columns of the projection's edges, (n,); equal where the size is
+            unknown.
         top, bottom: rows, (n,); NaN where the height is unknown.
         axis: column of the rotation axis, (n,).
     """
@@ -70,8 +71,8 @@ class View:
 
 
 def _beyond(low: FloatArray, high: FloatArray, size: int) -> FloatArray:
-    """Compute how far a projection reaches beyond the image's low and high edge [pixels],
-    (n, 2)."""
+    """Compute how far a projection reaches beyond the image's low and high edge
+    [pixels], (n, 2)."""
     return np.maximum(np.stack([-0.5 - low, high - (size - 0.5)], axis=1), 0.0)
 
 
@@ -180,8 +181,8 @@ def _tangents(p: Poses, radius: float) -> list[FloatArray]:
 
 
 def _rims(p: Poses, radius: float, half_height: float) -> list[FloatArray]:
-    """Compute the nearest and farthest points of the cylinder's two rims, four of (n, 3)
-    [mm]."""
+    """Compute the nearest and farthest points of the cylinder's two rims, four of
+    (n, 3) [mm]."""
     along = (p.source - p.axis)[:, :2]
     along = along / np.linalg.norm(along, axis=1, keepdims=True)
     return [

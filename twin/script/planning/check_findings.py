@@ -1,4 +1,4 @@
-"""What the dry run of a script finds: collisions, clearance, what projections see, dose."""
+"""Findings of a script's dry run: collisions, clearance, the projections' view, dose."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def cut_off(sides: Mapping[str, float]) -> str:
 
 @dataclass(frozen=True)
 class Collision:
-    """A contact on the way: which line moves, when, what touches what.
+    """A contact on the way: line that moves, time, parts that touch.
 
-    `last_free` is where every axis stands at the last moment that is still free.
+    `last_free` is the position of every axis at the last moment that is still free.
     """
 
     line: int
@@ -45,11 +45,11 @@ class Collision:
 
 @dataclass(frozen=True)
 class Clearance:
-    """What a collision check found over a whole plan.
+    """Result of the collision check of a plan.
 
-    `min_clearance_mm` of a plan with collisions is that at which the worst of them begins: how far
-    parts overlap then is not measured. `trace` are (time [s], smallest clearance [mm]) points for a
-    plot, in time order.
+    `min_clearance_mm` of a plan with collisions is that at which the worst of them
+    begins: how far parts overlap then is not measured. `trace` are (time [s], smallest
+    clearance [mm]) points for a plot, in time order.
     """
 
     collisions: tuple[Collision, ...] = ()
@@ -60,13 +60,15 @@ class Clearance:
 
 @dataclass(frozen=True)
 class Optics:
-    """What the projections of one camera setting see [mm, um]; ranges are (least, greatest).
+    """View of the projections of one camera setting [mm, um]; ranges are (least, greatest).
 
     Attributes:
         field_mm: width and height of the field of view at the rotation axis.
-        turn_field_mm: diameter of the cylinder seen whole over a full rotation.
-        truncation: None without a sample's size; else columns (and rows, if the height is known)
-            of its projection that fall beyond left, right, top, bottom, at worst over the rotation.
+        turn_field_mm: diameter of the cylinder that is completely visible over a full
+            rotation.
+        truncation: None without a sample's size; else columns (and rows, if the height is
+            known) of its projection that fall beyond left, right, top, bottom, at worst
+            over the rotation.
     """
 
     lines: tuple[int, int]
@@ -99,9 +101,9 @@ class Optics:
 
 @dataclass(frozen=True)
 class Dose:
-    """What matters for dose: beam time, charge on the target, time that makes images.
+    """Figures related to dose: beam time, charge on the target, time that makes images.
 
-    `charge_mAs` is power over voltage times beam time. It says nothing about dose in a sample:
+    `charge_mAs` is power over voltage times beam time. It is not the dose in a sample:
     spectrum, filter and distance are not in it.
     """
 

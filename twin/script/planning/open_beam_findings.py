@@ -37,7 +37,8 @@ def open_beam_problems(plan: ScanPlan, physics: Physics = "poly") -> tuple[Scrip
         physics: how counts are predicted.
 
     Returns:
-        Warnings `saturated_open_beam` and `starved_open_beam`, each with an exposure that would do.
+        Warnings `saturated_open_beam` and `starved_open_beam`, each with an exposure that
+        would do.
     """
     problems: list[ScriptProblem] = []
     for (exposure, camera), (line, indices) in lit_settings(plan).items():

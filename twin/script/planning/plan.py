@@ -1,9 +1,10 @@
 """The plan of a scan, and the report about it, as plain frozen data.
 
-A `ScanPlan` describes a script before it runs, on a clock that starts at 0: the position of each
-axis at any time, and the time, pose, settings and file of every image. Images of a sequence are
-columns of arrays and become `Exposure` values only on request. A `CheckReport` is what
-`ScanPlan.check` returns: problems, collisions and clearances, what the beam sees, dose.
+A `ScanPlan` describes a script before it runs, on a clock that starts at 0: the position
+of each axis at any time, and the time, pose, settings and file of every image. Images of
+a sequence are columns of arrays and become `Exposure` values only on request. A
+`CheckReport` is the result of `ScanPlan.check`: problems, collisions and clearances, the
+beam's view, dose.
 """
 
 from __future__ import annotations
@@ -48,9 +49,10 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
 
     Attributes:
         start: the scanner before the script.
-        steps: one for each command that has an effect or takes time, in the script's order.
-        trajectories: axis -> (time, trajectory), each in force until the next; axes that never
-            move have none.
+        steps: one for each command that has an effect or takes time, in the script's
+            order.
+        trajectories: axis -> (time, trajectory), each in force until the next; axes that
+            never move have none.
         groups: all images, in the order in which they are taken.
         settings: at the last `write settings file`, or None.
         beam: when X-rays are on.
@@ -115,8 +117,8 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
 
     @property
     def geometry(self) -> ConeVec:
-        """Nominal geometry of the projections that are saved; it carries the detector's shape where
-        all of them have the same."""
+        """Nominal geometry of the projections that are saved; it carries the detector's
+        shape where all of them have the same."""
         shapes = {g.camera.shape for g, _ in saved_images(self) if g.kind == "projection"}
         return self.poses.cone_vec().with_shape(shapes.pop() if len(shapes) == 1 else None)
 
@@ -124,8 +126,8 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
         """Check the plan: problems, collisions, truncation and dose, as `flexdt check` does.
 
         Args:
-            sample: what stands on the stage, as `flexdt.plan` takes it; None: what the
-                script says.
+            sample: the sample on the stage, as `flexdt.plan` takes it; None: that of the
+                script.
 
         Returns:
             `ok` is False with an error or a collision, and
@@ -176,9 +178,8 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
     def subframe_positions(self, samples: int) -> dict[str, FloatArray]:
         """Compute axis -> (n, samples) positions spread over each image's exposure.
 
-        The samples lie symmetrically about the nominal pose (assumed: no public source
-        says where in the exposure the trigger falls), so their mean has no bias against
-        it.
+        The samples are symmetric about the nominal pose (assumed: the trigger's place
+        within the exposure is not published), so their mean has no bias against it.
         """
         offsets = (np.arange(samples) + 0.5) / samples - 0.5
         of_group = [
@@ -236,7 +237,7 @@ def saved_images(plan: ScanPlan) -> Iterator[tuple[ExposureGroup, dict[str, Floa
 
 @dataclass(frozen=True)
 class CheckReport(WithProblems):
-    """The whole report; `to_dict` is the document of `flexdt check --json`."""
+    """The complete report; `to_dict` is the document of `flexdt check --json`."""
 
     plan: ScanPlan
     problems: tuple[ScriptProblem, ...]
@@ -261,7 +262,7 @@ class CheckReport(WithProblems):
 
     @property
     def start(self) -> str:
-        """Where the motors stand before, in words."""
+        """Positions of the motors at the start, in words."""
         at = ", ".join(f"{name}={x:g}" for name, x in self.plan.start.positions.items())
         if self.start_known:
             return at
@@ -269,7 +270,7 @@ class CheckReport(WithProblems):
 
     @property
     def sample(self) -> str:
-        """What stands on the stage, in words."""
+        """The sample on the stage, in words."""
         size = self.plan.sample
         if size is None:
             if self.start_known:

@@ -1,4 +1,4 @@
-"""What a plan is made of, as frozen values: start, steps, images, settings, beam, sample."""
+"""Parts of a plan, as frozen values: start, steps, images, settings, beam, sample."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class StartState:
     kV: float
     power_W: float
     xrays_on: bool | None = False
-    """None: nobody knows. They count as off, and switching them off takes its time."""
+    """None: unknown. They count as off, and switching them off takes its time."""
 
     @classmethod
     def of(cls, machine: Machine) -> StartState:
@@ -48,10 +48,11 @@ class PlanStep:
         index: place in `ScanPlan.steps`.
         line: line of the script.
         start_s: when the command starts to take effect.
-        duration_s: how long it takes; a move goes on after the script did when it does not wait.
+        duration_s: how long it takes; a move goes on after the script did when it does
+            not wait.
         holds_s: how long the script waits for it; the next step starts then.
-        assumed_s: the part of `holds_s` from the machine's timing and not from moves, pauses and
-            exposures.
+        assumed_s: the part of `holds_s` from the machine's timing and not from moves,
+            pauses and exposures.
         assumed_from: where that part comes from.
         what: one readable line.
         command: the typed command.
@@ -77,10 +78,11 @@ class PlanStep:
 
 @dataclass(frozen=True)
 class Exposure:
-    """One image: what is set and where every axis stands at its nominal moment `start_s`.
+    """One image: its settings and the position of every axis at its nominal moment `start_s`.
 
-    `file` is a bare file name (no folder), None for a preview, which is not saved. `step` indexes
-    `ScanPlan.steps`: the command that takes the image. `index` counts all images of the plan.
+    `file` is a bare file name (no folder), None for a preview, which is not saved. `step`
+    indexes `ScanPlan.steps`: the command that takes the image. `index` counts all images
+    of the plan.
     """
 
     index: int
@@ -112,7 +114,8 @@ class ExposureGroup(ArrayValue):
     Attributes:
         files: n bare file names, or empty for a preview.
         starts: (n,) nominal moments [s].
-        exact: axes whose positions are known by rule, (n,) each; others follow the trajectories.
+        exact: axes whose positions are known by rule, (n,) each; others follow the
+            trajectories.
         moving: whether an axis moves meanwhile.
     """
 
@@ -171,8 +174,8 @@ class SampleSize:
     def around(
         cls, size_mm: Sequence[float], source: str = "given", offset: StagePlacement | None = None
     ) -> SampleSize:
-        """Make the cylinder that contains a box of `size_mm` (x, y, z) at `offset`, at
-        every angle."""
+        """Make the cylinder that contains a box of `size_mm` (x, y, z) at `offset`,
+        at every angle."""
         at = StagePlacement() if offset is None else offset
         x, y, z = size_mm
         radius = 0.5 * math.hypot(x, y)

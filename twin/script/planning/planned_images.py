@@ -1,12 +1,13 @@
 """The camera's commands on the plan's clock: when each image is taken, where and to which file.
 
-Sequences over a moving axis follow the smooth-scan rule of fly scans. Gaps in the script (frames,
-averages) are inferred from speed and run-up where possible; otherwise a documented default is used,
-with a warning that names it.
+Sequences over a moving axis follow the smooth-scan rule of fly scans. Gaps in the script
+(frames, averages) are inferred from speed and run-up where possible; otherwise a
+documented default is used, with a warning that names it.
 
-The rule: with N images, exposure e, m averages and T = e m, speed v = turn / (N - 1) / T, and the
-motion starts v^2 / (2 a) + 4 T v before the first image and ends as far behind the last (checked
-against seven published scans to 1e-5 deg). Lengths are in the axis's unit (deg or mm), times in s.
+The rule: with N images, exposure e, m averages and T = e m, speed v = turn / (N - 1) / T,
+and the motion starts v^2 / (2 a) + 4 T v before the first image and ends as far behind
+the last (checked against seven published scans to 1e-5 deg). Lengths are in the axis's
+unit (deg or mm), times in s.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ def run_up(speed: float, acceleration: float, period_s: float) -> float:
 
 @dataclass(frozen=True)
 class Inference:
-    """What fills the gaps; `notes` says for each setting how it was found."""
+    """Values that fill the gaps; `notes` has for each setting how it was found."""
 
     frames: int
     averages: int
@@ -70,9 +71,9 @@ def infer(
 
     The scan's length is the motion's less one run-up at each end (the end is symmetric),
     rounded to whole turns for a rotation. Averages follow from frames where those are
-    stated, else from the run-up. `frames x speed x period` within half a step of whole
-    turns means that the images lie at turn / (frames - 1), as the scanner's own software
-    counts; otherwise they lie where the motor is.
+    stated, else from the run-up. `frames x speed x period` within half a step of full
+    turns means that the images are at turn / (frames - 1), as the scanner's own software
+    counts; otherwise they are where the motor is.
 
     Args:
         trigger: the move that waited for a position.
@@ -106,8 +107,8 @@ def infer(
 
 
 def images(step: float, frames: int, rotation: bool) -> tuple[float, float]:
-    """Compute (increment, mismatch over the scan) of `frames` images with `step` of
-    motion between."""
+    """Compute (increment, mismatch over the scan) of `frames` images with
+    `step` of motion between."""
     scan = step * (frames - 1)
     turns = round(scan / FULL_TURN_DEG)
     if rotation and turns >= 1 and abs(scan - turns * FULL_TURN_DEG) < 0.5 * step:
@@ -257,8 +258,8 @@ class ImageCollector:
         files: tuple[str, ...] = (),
         exact: Mapping[str, FloatArray] | None = None,
     ) -> ExposureGroup:
-        """Add images taken from `start` on with the settings in force; make them the last
-        ones."""
+        """Add images taken from `start` on with the settings in force; make them
+        the last ones."""
         tube = self.tube
         self.moved = self.motors.moving(start)
         lit = tube.lit(start)
@@ -329,7 +330,7 @@ class ImageCollector:
             period: exposure time of an image, averages included [s].
 
         Returns:
-            Moments (n,) [s]; motor -> positions (n,), empty if the images lie where the
+            Moments (n,) [s]; motor -> positions (n,), empty if the images are where the
             motor is.
         """
         trajectory = trigger.trajectory
@@ -369,7 +370,7 @@ class ImageCollector:
             exact = {}
         return starts, exact
 
-    # what is worth saying about a saved image ----------------------------------------------
+    # findings about a saved image ----------------------------------------------------------
 
     def _saved(self, draft: ExposureGroup) -> None:
         """Check saved images: name, stated settings and X-rays."""

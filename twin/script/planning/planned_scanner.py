@@ -1,7 +1,7 @@
 """The scanner while a plan is being made: motors, tube and camera on the plan's clock.
 
-It is used only inside the planner and models how devices behave in time; the planner's results are
-frozen values of `plan`.
+It is used only inside the planner and models how devices behave in time; the planner's
+results are frozen values of `plan`.
 """
 
 from __future__ import annotations
@@ -19,9 +19,11 @@ from flexdt.twin.script.planning.plan_values import BeamOn, StartState
 
 @dataclass(frozen=True)
 class Span:
-    """When a command takes effect and is complete; `release` is when a POS lets the script go on.
+    """When a command takes effect and is complete; `release` is when a POS lets the
+    script go on.
 
-    `assumed` is the part of it that comes from the machine's timing, `kind` which of its times.
+    `assumed` is the part of it that comes from the machine's timing, `kind` which of its
+    times.
     """
 
     start: float

@@ -1,7 +1,7 @@
 """A script to a plan: simulate it, check the beam's view, collect problems.
 
-The result is data; nothing moves. Collisions are checked by `dry_run`, which takes the check as a
-function.
+The result is data; nothing moves. Collisions are checked by `dry_run`, which takes the
+check as a function.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ def plan_script(
 ) -> ScanPlan:
     """Simulate `script` on a clock that starts at 0.
 
-    Problems of the script are in `ScanPlan.problems`; steps, motion and images are planned all the
-    same. Averages that the script leaves out and that follow from speed and run-up are used for the
-    images before the scan too.
+    Problems of the script are in `ScanPlan.problems`; steps, motion and images are
+    planned all the same. Averages that the script leaves out and that follow from speed
+    and run-up are used for the images before the scan too.
 
     Args:
         script: from `parse_script`, or a text or path to be parsed.
         machine: whose axes, limits, camera and timing these are; the FleX-ray if None.
-        profile: zero offsets, for what the beam sees; the machine's default if None.
+        profile: zero offsets, for the beam's view; the machine's default if None.
         start: the scanner before the script; the machine's homes and defaults if None.
         sample: its size; None takes the size that the script gives, if any.
 
@@ -83,7 +83,7 @@ def plan_script(
 
 
 def simulated(commands: tuple[c.Command, ...], machine: Machine, start: StartState) -> Simulation:
-    """Run commands on a virtual clock: steps, motion and images, without what the beam sees.
+    """Run commands on a virtual clock: steps, motion and images, without the beam's view.
 
     If averages are inferred from a scan, the commands run a second time with them,
     because they apply to the images before the scan as well.

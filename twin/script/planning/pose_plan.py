@@ -46,10 +46,11 @@ def plan_poses(
 ) -> ScanPlan:
     """Plan streamed poses (thesis 4.6.2): dark and flat, then one projection a pose.
 
-    The axes of a pose start together and all arrive before its image. The flat is taken at the
-    first pose, but with the sample beside the beam; X-rays stay on from then on. Dark and flat
-    average as many images as those of a composed script. The settings file is written at the first
-    pose. Line i + 1 of problems and steps is pose i; line 0 is what comes before.
+    The axes of a pose start together and all arrive before its image. The flat is taken
+    at the first pose, but with the sample beside the beam; X-rays stay on from then on.
+    Dark and flat average as many images as those of a composed script. The settings file
+    is written at the first pose. Line i + 1 of problems and steps is pose i; line 0 is
+    everything before.
 
     Args:
         poses: axis -> position [mm, deg]; axes left out stay where they are.
@@ -59,7 +60,8 @@ def plan_poses(
         start: the scanner before; the machine's homes if None.
         sample: its size, if known.
         flat: where the sample is out of the beam; True finds it, False takes no flat.
-        route: finds a free path to the flat and from there to the first pose; None: the direct one.
+        route: finds a free path to the flat and from there to the first pose; None: the
+            direct one.
 
     Raises:
         UnknownNameError: a pose names an axis that the machine does not have.

@@ -1,8 +1,10 @@
-"""Runs the commands of a script on a virtual clock and records steps, motion, images and problems.
+"""Runs the commands of a script on a virtual clock and records steps, motion,
+images and problems.
 
-There is one method for each kind of command. Each returns when the command takes effect and when it
-is complete; the command's wait decides when the script continues. A problem never ends the
-planning: steps and frames are planned all the same. `planner` judges the beam's view.
+There is one method for each kind of command. Each returns when the command takes effect
+and when it is complete; the command's wait decides when the script continues. A problem
+never ends the planning: steps and frames are planned all the same. `planner` judges the
+beam's view.
 """
 
 from __future__ import annotations
@@ -27,18 +29,18 @@ from flexdt.twin.script.problems import Findings
 
 # The binary argument of `scanner set sample info`: the sample's size and names.
 #
-# The layout was found in a published script and its settings files (no public specification;
-# assumed): big-endian, diameter [mm] as a double, then texts, each a 4-byte length and its bytes:
-# sample name, project, owner, and others. Data of another form are not an error, because the scan
-# itself does not use the argument.
+# The layout was found in a published script and its settings files (no public
+# specification; assumed): big-endian, diameter [mm] as a double, then texts, each a
+# 4-byte length and its bytes: sample name, project, owner, and others. Data of another
+# form are not an error, because the scan itself does not use the argument.
 
 _MAX_DIAMETER_MM = 10_000.0
 _CAMERA: Final = (c.CameraSetting, c.TakeImage, c.SaveImage, c.TakeSequence)
 
 
 def sample_size(data: bytes) -> SampleSize | None:
-    """Decode the sample's diameter from the argument of `set sample info`; None if it has
-    none."""
+    """Decode the sample's diameter from the argument of `set sample info`; None if
+    it has none."""
     if len(data) < 12:
         return None
     (diameter,) = struct.unpack_from(">d", data)
@@ -236,7 +238,7 @@ class Simulation:
         return False
 
     def _set_rate(self, command: c.SetSpeed | c.SetAcceleration) -> planned.Span:
-        """Set an axis's speed or acceleration, limited to what its motors allow."""
+        """Set an axis's speed or acceleration, limited to those of its motors."""
         if not self._axis(command):
             return self.timed("command", note=" (no effect)")
         what: Rate = "speed" if isinstance(command, c.SetSpeed) else "acceleration"
@@ -253,7 +255,7 @@ class Simulation:
         return self.timed("set_motor", note=note)
 
     def _tell(self, found: Arrival) -> None:
-        """Report what lies beyond a limit, as `twin/machine/travel.py` judges it."""
+        """Report a target beyond a limit, as `twin/machine/travel.py` judges it."""
         for message in found.told:
             if found.is_clamped(self.machine):
                 self.findings.warn("limit_clamped", f"{message}; set to the limit")

@@ -1,4 +1,4 @@
-"""Between which times a step or a scan takes, nine of ten times, by what a machine's logs tell."""
+"""90 % range of the time of a step or a scan, by a machine's logs."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ def step_range(step: PlanStep, timing: Timing) -> Range | None:
 def total_range(steps: Iterable[_OfKind], duration_s: float, timing: Timing) -> Range | None:
     """Compute (5 %, 95 %) of a scan's duration [s], or None as for `step_range`.
 
-    Steps are independent of each other, but what a kind's median is wrong by, from n
-    times, all its steps have in common: the variance of one step's error is (1 + 1/n) of
-    the command's own, that of N steps N + N^2 / n. The drift of all times is common to
-    all steps and added to that, as systematic errors are.
+    Steps are independent of each other, but the error of a kind's median, from n times,
+    is common to all its steps: the variance of one step's error is (1 + 1/n) of the
+    command's own, that of N steps N + N^2 / n. The drift of all times is common to all
+    steps and added to that, as systematic errors are.
 
     Args:
         steps: of a plan, or lines of a log.
