@@ -72,7 +72,7 @@ html_theme_options = {
     "logo": {"text": "flexdt"},
     "show_toc_level": 2,
     "navigation_with_keys": False,
-    "secondary_sidebar_items": {"**": ["page-toc"], "peers": [], "index": []},
+    "secondary_sidebar_items": {"**": ["page-toc"], "_generated/evidence/peers": [], "index": []},
     "footer_start": ["copyright"],
     "footer_end": [],
     "header_links_before_dropdown": 6,
@@ -80,4 +80,4 @@ html_theme_options = {
     "pygments_light_style": "a11y-high-contrast-light",
     "pygments_dark_style": "a11y-high-contrast-dark",
 }
-html_sidebars = {"index": [], "limits": [], "peers": []}
+html_sidebars = {"index": [], "limits": [], "_generated/evidence/peers": []}

@@ -21,8 +21,9 @@ def rendered(document: Mapping[str, Any]) -> str:
 
     Args:
         document: `title`, `about` and `sections`. A section has a `title`, `commands` (shell lines
-            that make its figures; none if its last column is `command`), and may have `measured`
-            (date, machine, load), `text` (paragraphs), `columns` and `rows` (cells in Markdown).
+            that make its figures; none if its last column is `command`, or if it has `sources`
+            of what it cites), and may have `measured` (date, machine, load), `text`
+            (paragraphs), `columns` and `rows` (cells in Markdown).
 
     Returns:
         The page. Headings of sections are its anchors.
@@ -33,6 +34,8 @@ def rendered(document: Mapping[str, Any]) -> str:
         parts += section.get("text", [])
         if section["commands"]:
             parts.append(_commands(section))
+        if "sources" in section:
+            parts.append(f"Sources: {section['sources']}.")
         if "columns" in section:
             parts.append(_table(section["columns"], section["rows"]))
     return "\n\n".join(parts) + "\n"
