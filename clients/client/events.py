@@ -16,6 +16,7 @@ import numpy.typing as npt
 from pydantic import BaseModel
 
 from flexdt.protocol import image, parse_result
+from flexdt.protocol.methods.image_messages import ImageOrigin
 from flexdt.protocol.methods.image_messages import Projection as WireProjection
 from flexdt.protocol.rpc_errors import RpcError
 from flexdt.protocol.state_model import ImageFlags, JobStatus, LogEntry, State
@@ -39,6 +40,7 @@ class Projection:
         time: of the pose, on the twin's clock [s].
         flags: fractions of saturated and starved pixels, edges at which the sample is cut off.
         marks: uint8 (rows, cols), if requested: sum of 1 saturated, 2 starved, 4 cut off.
+        origin: sample, tube, camera and correction that it was made of.
     """
 
     image: npt.NDArray[np.generic]
@@ -47,6 +49,7 @@ class Projection:
     time: float | None = None
     flags: ImageFlags | None = None
     marks: npt.NDArray[np.generic] | None = None
+    origin: ImageOrigin | None = None
 
     @classmethod
     def from_wire(cls, value: WireProjection) -> Projection:
@@ -58,7 +61,15 @@ class Projection:
         pixels = image.from_bytes(value.data, value.dtype, value.shape)
         m = value.marks
         marks = None if m is None else image.from_bytes(m.data, m.dtype, m.shape)
-        return cls(pixels, tuple(value.cone_vec), value.kind, value.time, value.flags, marks)
+        return cls(
+            image=pixels,
+            cone_vec=tuple(value.cone_vec),
+            kind=value.kind,
+            time=value.time,
+            flags=value.flags,
+            marks=marks,
+            origin=value.origin,
+        )
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:
         """The pixels, so that `numpy.asarray(projection)` is the image."""

@@ -45,6 +45,9 @@ class ImageFeed:
         self._raw: Mapping[str, object] | None = None
         self._due = asyncio.Event()
         self._address = address
+        self._link: KeptConnection | None = None
+        self._twin = ""
+        """The run of the twin that made `_raw`."""
         self._tasks: list[asyncio.Task[None]] = []
 
     def start(self) -> None:
@@ -54,6 +57,7 @@ class ImageFeed:
             name = f"flexdt viewer ({self.kind})"
             link = KeptConnection(self._address, name, self._arrived, subscription=wish)
             what = f"the feed of {self.kind} images"
+            self._link = link
             self._tasks = [watched(w, what, self._died) for w in (link.run(), self._work())]
 
     def stop(self) -> asyncio.Future[Any]:
@@ -75,6 +79,8 @@ class ImageFeed:
 
     def _arrived(self, topic: str, params: Mapping[str, object]) -> None:
         if topic == "projection":
+            hello = None if self._link is None else self._link.hello
+            self._twin = "" if hello is None else hello.instance or ""
             self._raw = params
             self._due.set()
 
@@ -93,7 +99,7 @@ class ImageFeed:
                     self._due.clear()
                     if self._raw is None:
                         continue
-                    self.newest = radiograph(self._raw)
+                    self.newest = radiograph(self._raw, self._twin)
                 if self.newest is not None:
                     await asyncio.to_thread(self._take, self.newest, coarse)
                 sound = True
@@ -103,8 +109,8 @@ class ImageFeed:
                 sound = False
 
 
-def radiograph(params: Mapping[str, object]) -> ShownImage:
-    """The image of a `projection` event.
+def radiograph(params: Mapping[str, object], twin: str = "") -> ShownImage:
+    """The image of a `projection` event, made by that run of the twin.
 
     Raises:
         RpcError: the event holds no image.
@@ -114,4 +120,14 @@ def radiograph(params: Mapping[str, object]) -> ShownImage:
     assert isinstance(shot, Projection)
     time = event.time if shot.time is None else shot.time
     flags = None if shot.flags is None else shot.flags.model_dump()
-    return ShownImage(shot.image, shot.kind, shot.cone_vec, time, event.seq, flags)
+    origin = None if shot.origin is None else shot.origin.model_dump()
+    return ShownImage(
+        pixels=shot.image,
+        kind=shot.kind,
+        cone_vec=shot.cone_vec,
+        time=time,
+        seq=event.seq,
+        flags=flags,
+        origin=origin,
+        twin=twin,
+    )

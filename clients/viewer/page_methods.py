@@ -355,7 +355,7 @@ async def recorded_image(viewer: Viewer, page: Page, params: RecordedImage) -> o
     pixels, virtual = wire_image.decode(told), None
     if params.virtual and told["image"] == "projection" and told["positions"]:
         try:
-            virtual = await _virtual(page, told)
+            virtual, about["virtual_origin"] = await _virtual(page, told)
         except RpcError as error:
             about["problem"] = error.message
     if page.recorded != name:
@@ -390,12 +390,14 @@ def _readout(cone: Sequence[float], shape: tuple[int, ...]) -> Mapping[str, obje
     return None if found is None else vars(found)
 
 
-async def _virtual(page: Page, told: Mapping[str, Any]) -> Any:
-    """The image that the twin predicts where one of a data set was taken, as it was exposed."""
+async def _virtual(page: Page, told: Mapping[str, Any]) -> tuple[Any, Any]:
+    """The image that the twin predicts where one of a data set was taken, as it was exposed, and
+    what it is made of."""
     asked = {name: told[name] for name in ("kind", "positions")}
     for what in ("tube", "camera"):  # what is not known of it is as it is now
         asked[what] = {k: v for k, v in told[what].items() if v is not None}
-    return wire_image.decode(await page.link.request("projection.get", asked))  # type: ignore[arg-type]
+    answer: Any = await page.link.request("projection.get", asked)
+    return wire_image.decode(answer), answer.get("origin")
 
 
 async def live(viewer: Viewer, page: Page, params: Live) -> object:

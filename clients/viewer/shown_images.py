@@ -39,6 +39,8 @@ class ShownImage:
         seq: the event's number.
         flags: what the twin says of it; None of a recorded one.
         virtual: to compare it with, of the same shape and kind; None for none.
+        origin: what the twin made it of (`ImageOrigin` of the wire); None of a recorded one.
+        twin: run of the twin that made it; "" where that is not known.
     """
 
     pixels: npt.NDArray[np.generic]
@@ -48,6 +50,8 @@ class ShownImage:
     seq: int
     flags: object = None
     virtual: npt.NDArray[np.generic] | None = None
+    origin: Mapping[str, object] | None = None
+    twin: str = ""
 
 
 def window_of(image: ShownImage) -> tuple[float, float]:
@@ -111,6 +115,8 @@ def packed(
         "cone_vec": list(image.cone_vec),
         "seq": image.seq,
         "flags": image.flags,
+        "origin": image.origin,
+        "twin": image.twin,
         "window": list(window_of(image)),
         "beads": [[round(float(c), 3), round(float(r), 3)] for c, r in beads],
         **facts,

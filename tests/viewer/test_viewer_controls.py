@@ -377,7 +377,7 @@ def test_an_ended_scan_and_a_correction_are_taken_off_their_lists(
     page.locator("#job-forget").wait_for()
     page.click("#job-forget")
     wait(lambda: job not in {one.job for one in twin.jobs().jobs}, "forgotten")
-    page.locator("#job-card").wait_for(state="hidden")
+    page.locator("#scan-bar").wait_for(state="hidden")
     old, _ = (
         call("calibration.apply", {"parameters": {"dO_x": x}})["correction"]["name"]
         for x in (0.1, 0.2)

@@ -143,12 +143,13 @@ def test_the_geometry_that_is_read_is_that_of_the_image_shown(
         assert f"magnification\n{sdd / now.SOD_mm:.4f}×" in said
         assert f"voxel\n{1000 * 0.1496 * now.SOD_mm / sdd:.2f} µm" in said
         assert said.endswith("beam\n90 kV, 20 W")
-        assert page.inner_text("#geometry-of") == "of whole scan, image 3: nominal"
-        assert page.locator("#near-live").is_visible()
+        assert page.text_content("#geometry-title") == "Geometry of whole scan, image 3"
+        assert page.inner_text("#geometry-of") == "nominal, as scanned"
         page.evaluate("flexdt.data.open('bare')")
         page.locator(
-            "#geometry-of", has_text=re.compile(r"^of bare, image \d: not known$")
+            "#geometry-title", has_text=re.compile(r"^Geometry of bare, image \d$")
         ).wait_for()
+        assert page.inner_text("#geometry-of") == "not known"
         assert "SDD\n–" in read()
         page.evaluate("flexdt.data.open(null)")
         wait(lambda: live in read(), "the machine's again")

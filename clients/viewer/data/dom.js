@@ -1,4 +1,7 @@
 // Small helpers for building the page.
+import { parsed } from "./figures.js";
+import { plain } from "./names.js";
+export { bytes, fixed, isNumber, parsed, seconds } from "./figures.js";
 export const $ = (selector, root = document) => {
     const found = root.querySelector(selector);
     if (!found)
@@ -18,12 +21,15 @@ export function el(tag, attributes = {}, ...children) {
             node.addEventListener(name.slice(2), value);
         else if (name === "class")
             node.className = String(value);
+        else if (name === "title")
+            node.title = plain(String(value));
         else if (name in node && name !== "list")
             node[name] = value;
         else
             node.setAttribute(name, String(value));
     }
-    node.append(...children.filter((c) => c !== null && c !== undefined));
+    const given = children.filter((c) => c !== null && c !== undefined);
+    node.append(...given.map((c) => (typeof c === "string" ? plain(c) : c)));
     return node;
 }
 // Id of a button -> what it does.
@@ -42,18 +48,6 @@ export function pressed(f) {
                 f();
         },
     };
-}
-export function fixed(value, digits = 2) {
-    if (!isNumber(value))
-        return "–";
-    const text = value.toFixed(digits);
-    return Number(text) === 0 ? text.replace("-", "") : text;
-}
-export const isNumber = (value) => Number.isFinite(value);
-// The number a person typed: a decimal comma is a point, and what is no number is none (never 0).
-export function parsed(text) {
-    const plain = text.trim().replace("−", "-").replace(",", ".");
-    return /^[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?$/i.test(plain) ? Number(plain) : NaN;
 }
 // A field for a number (as text: browsers drop what they cannot read from number fields without a word).
 // What is typed is marked until Enter applies it or Escape takes it back.
@@ -82,29 +76,10 @@ export function numeric(input, apply, back) {
     });
     return input;
 }
-export function seconds(s) {
-    if (!isNumber(s))
-        return "–";
-    s = Math.round(s);
-    const h = Math.floor(s / 3600), m = Math.floor((s % 3600) / 60);
-    return h
-        ? `${h} h ${String(m).padStart(2, "0")} min`
-        : m
-            ? `${m} min ${String(s % 60).padStart(2, "0")} s`
-            : `${s} s`;
-}
-export function bytes(n) {
-    const units = ["B", "kB", "MB", "GB", "TB"];
-    let i = 0;
-    while (n >= 1000 && i < 4) {
-        n /= 1000;
-        i++;
-    }
-    return `${n.toFixed(i ? 1 : 0)} ${units[i]}`;
-}
 export function setText(node, text) {
-    if (node.textContent !== text)
-        node.textContent = text;
+    const shown = plain(text);
+    if (node.textContent !== shown)
+        node.textContent = shown;
 }
 export function download(url, name) {
     const a = el("a", { href: url, download: name });

@@ -97,12 +97,12 @@ function develop(i) {
     pixels2d.putImageData(out, 0, 0);
 }
 // An image taken with the beam off says so: it is dark, or drawn as though the beam were on.
-function unlit(i) { const tube = store.state?.tube; return i !== null && !i.recorded && tube !== undefined && !(tube.on && tube.ready); }
+const unlit = (i) => i !== null && !i.recorded && i.origin?.lit === false;
 function beam(i) {
     const tube = store.state?.tube, off = unlit(i);
     $("#film-beam").hidden = !off;
     if (off)
-        setText($("#film-beam"), tube?.on ? "X-rays warming up" : i?.kind === "counts" ? "X-rays off: dark image" : "X-rays off: drawn as though on");
+        setText($("#film-beam"), tube?.on && !tube.ready ? "X-rays warming up" : i?.kind === "counts" ? "X-rays off: dark image" : "X-rays off: drawn as though on");
 }
 // The part of the beam that comes through: from the thickest place (all but one in a hundred let more through) on.
 function transmission(i) {

@@ -1,6 +1,7 @@
 // The page's connection to its viewer: requests with answers, newest states and images, how old they are,
 // reconnection.
 import { keep, words } from "./dom.js";
+import { differences, ofData, ofImage, ofNow, } from "./fingerprint.js";
 export const pageId = (window.pageId = [...crypto.getRandomValues(new Uint8Array(12))]
     .map((b) => b.toString(16).padStart(2, "0"))
     .join(""));
@@ -20,7 +21,9 @@ export const store = {
     received: { state: 0, image: 0 },
     age: 0,
     fresh: null,
+    now: null,
     imageAge: 0,
+    imageDiffers: [],
     job: null,
     refused: null,
     problem: null,
@@ -127,6 +130,7 @@ const handlers = {
             coneVec: m.cone_vec,
         });
         store.received.state++;
+        store.now = ofNow(m.state, m.cone_vec, store.hello);
         if (!store.twin) {
             store.twin = true;
             emit("connection");
@@ -142,6 +146,8 @@ const handlers = {
             cameras: m.cameras,
         });
         store.hello = m.hello ?? store.hello;
+        if (store.state)
+            store.now = ofNow(store.state, store.coneVec, store.hello);
         emit("connection");
     },
     session(m) {
@@ -193,13 +199,21 @@ function late(sent) {
     return now - sent - least.lag;
 }
 let differs = null;
+// What an image that the page has was made of.
+export function imageMade(image) {
+    const { recorded } = image;
+    if (recorded)
+        return ofData(recorded.name, recorded.index);
+    return ofImage(image.origin, image.cone_vec, image.twin);
+}
 function look() {
     const now = performance.now();
     store.age = heard === null ? 0 : (now - heard.at) / 1000 + heard.late + heard.silent;
     store.fresh = store.age > OLD_S ? null : (store.fresh ?? now);
-    // An image of another pose than the state's is old, once none has come for a while.
-    const i = store.image, c = store.coneVec;
-    const apart = i && !i.recorded && c && i.cone_vec.some((v, k) => Math.abs(v - c[k]) > 1e-3) ? i : null;
+    // An image of other things than the state's is old, once none has come for a while.
+    const image = store.image;
+    store.imageDiffers = image && store.now ? differences(imageMade(image), store.now) : [];
+    const apart = image && store.imageDiffers.length && !image.recorded ? image : null;
     differs = apart ? (differs ?? now) : null;
     store.imageAge =
         apart && differs !== null ? (now - Math.max(differs, apart.at_ms)) / 1000 : 0;

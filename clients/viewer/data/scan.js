@@ -1,12 +1,13 @@
-// The Scan tab: a script to write, check, scrub and run; the job's progress; thumbnails of its frames.
-import { $, $button, $canvas, $input, $select, bytes, chosen, clicks, el, fixed, isNumber, pressed, putGrey, seconds, slid, words, } from "./dom.js";
+// The Scan tab: a script to write, check, scrub and run.
+import { $, $button, $canvas, $input, $select, bytes, chosen, clicks, el, fixed, isNumber, pressed, seconds, setText, slid, words, } from "./dom.js";
 import { call, command, emit, Failure, on, store } from "./link.js";
 import { rememberedScript, rememberScript } from "./address.js";
 import { folder, open as openData } from "./data.js";
+import { differences, listed, only } from "./fingerprint.js";
 import { draw as drawTimeline } from "./timeline.js";
 import * as designer from "./designer.js";
-const FINAL = ["done", "failed", "aborted", "incomplete"];
-const MAX_THUMBS = 40;
+import { isOver } from "./job_words.js";
+import { wished } from "./scan_wish.js";
 const text = $("#script"), gutter = $("#gutter"), ink = $("#paint div"), LINE_PX = 16;
 let written = [""], worst = new Map(), problems = [], plan = null, planned = "", lost = false, sent = "";
 designer.place($("#tab-scan .card"));
@@ -18,16 +19,7 @@ clicks({
     compose: () => compose(),
     unscrub: () => scrub(null),
     "job-scrub": recall,
-    "job-forget": forgetJob,
-    "job-data": () => {
-        emit("show-tab", "data");
-        void openData(folder(store.job), null, true);
-    },
 });
-for (const action of ["pause", "resume", "step", "abort"])
-    clicks({
-        [`job-${action}`]: () => command(`job.${action}`, { job: store.job?.job }, `Cannot ${action}`),
-    });
 function marks() {
     written = text.value.split("\n");
     worst = new Map();
@@ -134,23 +126,14 @@ export function goTo(line) {
     text.scrollLeft = 0;
 }
 async function compose(keep = []) {
-    const frames = $input("#wish-frames").valueAsNumber, exposure_ms = $input("#wish-exposure").valueAsNumber;
     const none = "No script was composed";
-    if (!Number.isInteger(frames) || frames < 1) {
-        emit("note", "error", none, "frames: a whole number above 0");
+    const wish = wished();
+    if (typeof wish === "string") {
+        emit("note", "error", none, wish);
         return;
     }
-    if (!(exposure_ms > 0)) {
-        emit("note", "error", none, "ms: a number above 0");
-        return;
-    }
-    const answer = await command("viewer.compose", {
-        kind: $select("#wish-kind").value,
-        ...designer.wish(),
-        frames,
-        exposure_ms,
-        keep,
-    }, none);
+    const params = { ...designer.wish(), ...wish, keep };
+    const answer = await command("viewer.compose", params, none);
     if (!answer)
         return;
     setScript(answer.text);
@@ -179,7 +162,9 @@ function offer(moved, kept) {
     }, axes.length > 1 ? "Keep them where they stand" : "Keep it where it stands")));
 }
 async function check() {
-    const report = $("#report"), asked = text.value;
+    const report = $("#report");
+    const asked = text.value;
+    const made = now();
     report.textContent = "checking…";
     let answer;
     try {
@@ -212,11 +197,12 @@ async function check() {
             bytes: 0,
             duration_s: NaN,
             min_clearance_mm: null,
+            min_clearance_pair: null,
         };
     }
     if (text.value !== asked)
         return false;
-    show(answer);
+    show(answer, made);
     return answer.ok;
 }
 // A script that may run is drawn over time, too.
@@ -224,19 +210,24 @@ async function checkAndPlan() {
     if (await check())
         await makePlan(text.value, null);
 }
-export function show(r) {
+const MOVING_PARTS = "Of parts that move against each other; those that stand or move together are not counted";
+function clearance({ min_clearance_mm: mm, min_clearance_pair: pair }) {
+    if (!isNumber(mm))
+        return "";
+    const parts = pair ? pair.join(" and ") : "moving parts";
+    return `${parts} come closest, ${fixed(mm, 1)} mm apart`;
+}
+export function show(r, made = now()) {
     // Each of `collisions` is among the problems already, in words.
     problems = r.problems.map((p) => p.code === "collision" ? { ...p, message: `collision: ${p.message}` } : p);
     marks();
     const box = $("#report");
     box.textContent = "";
-    const clearance = isNumber(r.min_clearance_mm)
-        ? ` · moving parts stay ${fixed(r.min_clearance_mm, 1)} mm apart`
-        : "";
+    const facts = [seconds(r.duration_s), `${r.frames} frames`, bytes(r.bytes), clearance(r)];
     box.append(el("div", {}, el("span", { class: `verdict ${r.ok ? "ok" : "bad"}` }, r.ok ? "Ready to run" : "Not ready"), el("span", {
         class: "muted",
-        title: "Of parts that move against each other; those that stand or move together are not counted",
-    }, `  ${seconds(r.duration_s)} · ${r.frames} frames · ${bytes(r.bytes)}${clearance}`)));
+        title: MOVING_PARTS,
+    }, `  ${facts.filter(Boolean).join(" · ")}`)));
     const link = (line) => line
         ? el("a", pressed(() => goTo(line)), `line ${line}`)
         : el("span", { class: "muted" }, "whole");
@@ -245,23 +236,59 @@ export function show(r) {
     }
     if (r.steps.length)
         box.append(el("div", { class: "steps mono" }, ...r.steps.slice(0, 500).map(stepRow)));
-    checked = store.state && stands(store.state);
+    checked = made;
 }
-// A report holds for what the machine was when it came: any client may change that.
+// A report holds for what a script begins with. While a scan runs, the machine is on its way: what
+// it then differs in is known when it has ended, and after a run of this script it is checked anew.
+const BEGUN_WITH = [
+    "twin",
+    "machine",
+    "sample",
+    "placement",
+    "motors",
+    "camera",
+    "tube",
+    "correction",
+];
 let checked = null;
-const stands = (s) => JSON.stringify([
-    s.sample,
-    s.correction,
-    Object.entries(s.axes).map(([name, { position }]) => [name, position.toFixed(2)]),
-]);
-on("state", (s) => {
-    const box = $("#report"), stale = box.querySelector(".verdict") !== null && checked !== stands(s);
-    box.classList.toggle("stale", stale);
+let ran = null;
+const now = () => (store.now ? only(store.now, ...BEGUN_WITH) : null);
+function outdates() {
+    const stands = now();
+    if (!checked || !stands || store.state?.job)
+        return [];
+    return differences(checked, stands);
+}
+on("state", () => {
+    const box = $("#report");
+    const differ = box.querySelector(".verdict") === null ? [] : outdates();
+    box.classList.toggle("stale", differ.length > 0);
     const old = document.getElementById("stale");
-    if (stale && !old)
-        box.prepend(el("div", { id: "stale" }, "The machine has changed since: check again"));
-    else if (!stale)
+    if (!differ.length) {
         old?.remove();
+        return;
+    }
+    const words = `The machine has changed since (${listed(differ)}): check again`;
+    if (old)
+        setText(old, words);
+    else
+        box.prepend(el("div", { id: "stale" }, words));
+});
+on("scan", () => {
+    const job = store.job;
+    if (!ran || job?.job !== ran.job || !isOver(job))
+        return;
+    const { script } = ran;
+    ran = null;
+    if (script === text.value && checked)
+        recheck = true;
+});
+let recheck = false;
+on("state", (state) => {
+    if (!recheck || state.job || Object.values(state.axes).some((axis) => axis.moving))
+        return;
+    recheck = false;
+    void check();
 });
 function stepRow(s) {
     const go = () => {
@@ -345,7 +372,7 @@ export async function scrub(time) {
 function redraw() {
     if (!plan)
         return;
-    drawTimeline($canvas("#timeline"), plan, at, store.job && !FINAL.includes(store.job.state) ? store.job.elapsed_s : null);
+    drawTimeline($canvas("#timeline"), plan, at, store.job && !isOver(store.job) ? store.job.elapsed_s : null);
     const now = at, step = now === null ? null : plan.steps.findLast((s) => s.start_s <= now + 1e-9);
     $("#scrub-at").textContent =
         at === null
@@ -395,142 +422,17 @@ async function run() {
     });
     if (!answer)
         return;
+    ran = { job: answer.job, script: text.value };
     emit("note", "good", "Scan", `${answer.job} has begun`);
     for (const warning of answer.warnings.slice(0, 3))
         emit("note", "warning-note", "Scan", warning);
     if (at !== null)
         void scrub(null);
 }
-// Jobs come in events of their own and inside states, which may be a little older: those change nothing.
-let toldAt = -Infinity;
-on("connection", () => {
-    if (!store.twin)
-        toldAt = -Infinity;
-}); // a twin that starts again counts from 0
-function showJob(job) {
-    const last = store.job, fresh = last?.job !== job.job;
-    if (fresh && job.state === "queued" && last && !FINAL.includes(last.state))
-        return; // its turn comes
-    if (!fresh && (job.time < toldAt || (job.time === toldAt && FINAL.includes(last.state))))
-        return;
-    toldAt = job.time;
-    store.job = job;
-    const over = FINAL.includes(job.state);
-    if (fresh) {
-        $("#thumbs").textContent = "";
-        lastThumb = -1;
-        lastImage = store.received.image;
-        ended = null;
-    }
-    if (over && !ended) {
-        ended = { time: job.time + LATE_S, at: fresh ? -Infinity : performance.now() };
-        thumb();
-    }
-    $("#job-card").hidden = false;
-    $("#job-name").textContent = job.name || job.job;
-    $("#job-state").textContent = `${job.state}${pace(job.speed_up)}`;
-    const bar = $("#job-bar"), share = job.frames_total
-        ? job.frames_done / job.frames_total
-        : job.state === "done"
-            ? 1
-            : 0;
-    bar.className = `progress ${over && job.state !== "done" ? "failed" : job.state}`;
-    $("i", bar).style.width = `${(100 * share).toFixed(1)}%`;
-    $("#job-frames").textContent = `${job.frames_done} / ${job.frames_total} frames`;
-    $("#job-left").textContent = over ? seconds(job.elapsed_s) : left(job);
-    const line = job.line ? `line ${job.line}: ` : "";
-    $("#job-what").textContent = job.error
-        ? told(job)
-        : over
-            ? (job.dataset ?? "")
-            : `${line}${job.what}`;
-    $button("#job-pause").disabled = job.state !== "running";
-    $button("#job-resume").disabled = $button("#job-step").disabled = job.state !== "paused";
-    $button("#job-abort").disabled = over;
-    for (const id of ["#job-scrub", "#job-data", "#job-forget"])
-        $button(id).hidden = !over;
+on("scan", (fresh) => {
     if (fresh || plan)
         redraw();
-}
-const told = (job) => typeof job.error?.message === "string" ? job.error.message : "";
-const pace = (speed) => speed === "max" ? " · max" : speed !== 1 ? ` · ${speed}×` : "";
-function left(job) {
-    const factor = job.real_time_factor || (job.speed_up === "max" ? null : job.speed_up);
-    return isNumber(job.remaining_s)
-        ? `${seconds(factor ? job.remaining_s / factor : job.remaining_s)} left`
-        : "";
-}
-// A stop that somebody commanded is no failure: the warning below the scene says that the scan is paused.
-const meant = (job) => job.state === "paused" &&
-    ["stop", "E-stop"].includes(job.error?.data?.asked ?? "");
-on("job", (job) => {
-    const before = store.job, news = before?.job === job.job && before.state !== job.state;
-    showJob(job);
-    if (news && job.error && !meant(job))
-        emit("note", "error", `Scan ${job.state}`, told(job));
 });
-on("state", (state) => {
-    if (state.job)
-        showJob(state.job);
-    else if (store.job && !FINAL.includes(store.job.state))
-        void catchUp();
-});
-// No scan runs, and its end was not heard of: the connection was away meanwhile.
-const AGAIN_MS = 1000;
-let caughtUp = -Infinity;
-async function catchUp() {
-    const job = store.job?.job;
-    if (job === undefined || performance.now() < caughtUp + AGAIN_MS)
-        return;
-    caughtUp = performance.now();
-    const status = await call("job.status", { job }).catch((error) => error instanceof Failure && error.code === -32602 ? null : undefined);
-    if (store.job?.job !== job || status === undefined)
-        return;
-    if (status) {
-        showJob(status);
-        return;
-    }
-    store.job = null; // a twin that knows nothing of it
-    $("#job-card").hidden = true;
-}
-async function forgetJob() {
-    const job = store.job?.job;
-    if (job === undefined || !(await command("job.forget", { job }, "The job stays")))
-        return;
-    store.job = null;
-    $("#job-card").hidden = true;
-}
-// The last frame's image may come a little after the scan's end, by our clock, or be of a little after it, by the twin's.
-const LATE_S = 1.5;
-let lastThumb = -1, lastImage = 0, ended = null;
-on("image", thumb);
-function thumb() {
-    const job = store.job, image = store.image;
-    if (!job ||
-        !job.frames_done ||
-        !image ||
-        image.recorded ||
-        store.received.image === lastImage)
-        return;
-    if (ended && image.time > ended.time && performance.now() > ended.at + 1000 * LATE_S)
-        return;
-    const every = Math.max(1, Math.floor(job.frames_total / MAX_THUMBS)), k = Math.floor(job.frames_done / every);
-    if (k === lastThumb)
-        return;
-    lastThumb = k;
-    lastImage = store.received.image;
-    $("#thumb-card").hidden = false;
-    const [rows, cols] = image.shape, w = 124, h = Math.max(1, Math.round((w * rows) / cols));
-    const c = el("canvas"), [low, high] = image.window;
-    putGrey(c, [h, w], (k) => {
-        const r = Math.floor(k / w), v = image.low +
-            image.scale *
-                image.pixels[Math.floor((r * rows) / h) * cols + Math.floor(((k - r * w) * cols) / w)];
-        return Math.min(255, Math.max(0, (255 * (v - low)) / (high - low))) | 0;
-    });
-    $("#thumbs").append(el("figure", {}, c, el("figcaption", {}, String(job.frames_done))));
-    $("#thumbs").scrollLeft = 1e6;
-}
 marks();
 void rememberedScript().then((script) => {
     if (script && !text.value)

@@ -1,5 +1,6 @@
 // The Setup tab: tube, camera, sample on the stage (with upload), layers of the scene.
-import { $, $$, $button, $canvas, $input, $select, base64, cleared, clicks, el, fixed, keep, numeric, parsed, words, } from "./dom.js";
+import { $, $$, $button, $canvas, $input, $select, base64, cleared, clicks, el, fixed, keep, numeric, parsed, setText, words, } from "./dom.js";
+import { differences, listed, only } from "./fingerprint.js";
 import { call, command, emit, on, store } from "./link.js";
 const CHUNK = 3 << 20;
 const FORMATS = ["stl", "obj", "ply", "glb", "off"];
@@ -217,35 +218,38 @@ const PHYSICS = {
     mono: "Photons of one energy, as many as the spectrum below would make visible: voltage changes brightness and noise, not contrast.",
     poly: "Photons of all energies below, through the filters: voltage changes contrast, brightness and noise.",
 };
+// What a prediction is made of; it goes with that.
+const predictable = () => store.now ? only(store.now, "twin", "machine", "sample", "tube", "camera", "distances") : {};
+let predicted = null;
 async function predict() {
-    if (!store.state)
-        return;
-    const now = predictable(store.state);
+    const made = predictable();
     predicted = null;
     $button("#predict").disabled = true;
-    $("#predicted").textContent = "a few seconds …";
+    setText($("#predicted"), "a few seconds …");
     const p = await command("exposure.predict", {}, "No prediction");
     $button("#predict").disabled = false;
-    const setting = (s) => `${fixed(s.kV, 0)} kV${s.filter ? ` ${s.filter}` : ""}: ${s.cnr === null ? "saturated" : fixed(s.cnr, 1)}`;
-    const told = (p) => [
-        `contrast to noise of ${p.detail}: ${setting(p.asked)}`,
-        ...p.best.slice(0, 1).map((s) => `best ${setting(s)}`),
-        `1 % of the pixels see ${fixed(100 * p.transmission.p1, 1)} % or less`,
-    ];
-    $("#predicted").textContent = p ? told(p).join(" · ") : "";
+    setText($("#predicted"), p ? predictionWords(p) : "");
     if (p)
-        predicted = now;
+        predicted = made;
 }
-// What a prediction was made for; it goes with that.
-let predicted = null;
-const predictable = ({ sample, tube, camera, geometry: g }) => JSON.stringify([
-    sample,
-    tube.kV,
-    tube.power_W,
-    camera,
-    g.SOD_mm.toFixed(2),
-    g.SDD_mm.toFixed(2),
-]);
+function predictionWords(p) {
+    const told = [`contrast to noise of ${p.detail}: ${setting(p.asked)}`];
+    if (p.best.length)
+        told.push(`best ${setting(p.best[0])}`);
+    told.push(`1 % of the pixels see ${fixed(100 * p.transmission.p1, 1)} % or less`);
+    return told.join(" · ");
+}
+function setting({ kV, filter, cnr }) {
+    const quality = cnr === null ? "saturated" : fixed(cnr, 1);
+    return `${fixed(kV, 0)} kV${filter ? ` ${filter}` : ""}: ${quality}`;
+}
+function outdatePrediction() {
+    const differ = predicted ? differences(predicted, predictable()) : [];
+    if (!differ.length)
+        return;
+    predicted = null;
+    setText($("#predicted"), `made for another ${listed(differ)}: predict again`);
+}
 let spectrumOf = null;
 async function spectrum(kV) {
     if (spectrumOf === kV || $("#tab-setup").hidden)
@@ -286,15 +290,11 @@ on("tab", () => {
 on("session", () => {
     spectrumOf = null;
 });
-let listed;
+let listedFor;
 on("session", list);
 on("state", show);
 function show(state) {
-    if (predicted !== null && predicted !== predictable(state)) {
-        predicted = null;
-        $("#predicted").textContent =
-            "sample, beam, camera or distances have changed: predict again";
-    }
+    outdatePrediction();
     void spectrum(state.tube.kV);
     put("kV", state.tube.kV, 2);
     put("power", state.tube.power_W, 2);
@@ -316,8 +316,8 @@ function show(state) {
     $("#sample-note").textContent = s.size_mm
         ? s.size_mm.map((v) => fixed(v, 1)).join(" × ") + " mm"
         : "";
-    if (listed !== s.name) {
-        listed = s.name;
+    if (listedFor !== s.name) {
+        listedFor = s.name;
         void list();
     }
 }

@@ -1,265 +1,226 @@
-// The scan designer: bars for voxel, tube, exposure and images; what a scan with them will look like. A change of a bar
-// rewrites the script, unless somebody else's stands there.
-import {
-  $input,
-  $select,
-  bars,
-  bytes,
-  cleared,
-  el,
-  fixed,
-  seconds,
-  setText,
-  words,
-} from "./dom.js";
-import type { Compose, ExposurePrediction, TransmissionShares } from "./viewer.js";
+// The scan designer: bars for voxel and tube; what the wished scan will look like. A change of the
+// wish rewrites the script, unless somebody else's stands there.
+import { $input, bars, bytes, cleared, el, fixed, seconds, setText, words } from "./dom.js";
+import { differences, listed, only, sampleOf, type Fingerprint } from "./fingerprint.js";
+import type { ExposurePrediction, TransmissionShares } from "./viewer.js";
 import { call, emit, on, store } from "./link.js";
+import { effect } from "./signals.js";
+import { exposure_ms, frames, kind, setExposure, wished as wishedScan } from "./scan_wish.js";
 
-const SETTLE_MS = 400,
-  LATEST = 1.02;
+const SETTLE_MS = 400;
+const CNR_TOLERANCE = 1.02;
+const BAR_STEPS = 1000;
+const VOXEL_RANGE = 20; // from a pixel's size at this magnification to a pixel's
+const DARK_TRANSMISSION = 0.02;
 // Bars are logarithmic where values are; [name, words, unit, digits].
-type Bar = "voxel_um" | "kV" | "power_W" | "exposure_ms" | "frames";
+type Bar = "voxel_um" | "kV" | "power_W";
 const BARS: Array<[name: Bar, words: string, unit: string, digits: number]> = [
   ["voxel_um", "voxel", "µm", 1],
   ["kV", "voltage", "kV", 0],
   ["power_W", "power", "W", 0],
-  ["exposure_ms", "exposure", "ms", 0],
-  ["frames", "images", "", 0],
 ];
-type Scale = [low: number, high: number, log: boolean];
-const scales: Partial<Record<Bar, Scale>> = {},
-  inputs = {} as Record<Bar, HTMLInputElement>;
-const row = ([name, words, unit, digits]: (typeof BARS)[number]) => {
+interface Scale {
+  low: number;
+  high: number;
+  log: boolean;
+}
+const scales: Partial<Record<Bar, Scale>> = {};
+const inputs = {} as Record<Bar, HTMLInputElement>;
+let longest_ms = 0; // exposure that the camera takes
+
+function bar([name, words, unit, digits]: (typeof BARS)[number]): HTMLElement[] {
   const out = el("output", { id: `design-${name}-is`, class: "mono" });
   const say = () => setText(out, `${fixed(value(name), digits)} ${unit}`);
-  inputs[name] = el("input", {
-    type: "range",
-    id: `design-${name}`,
-    min: 0,
-    max: 1000,
-    step: "any",
-    oninput: say,
-    onchange: changed,
-  });
+  const id = `design-${name}`;
+  const steps = { type: "range", min: 0, max: BAR_STEPS, step: "any" };
+  inputs[name] = el("input", { ...steps, id, oninput: say, onchange: changed });
   return [
-    el("label", { class: "muted", htmlFor: `design-${name}` }, words),
+    el("label", { class: "muted", htmlFor: id }, words),
     el("span", { class: "row" }, inputs[name], out),
   ];
-};
-const word = (id: string, label: string, start: string, title: string) => [
-  el("label", { class: "muted", htmlFor: id, title }, label),
-  el("input", { type: "text", id, value: start, title, onchange: changed }),
-];
+}
+function word(id: string, label: string, value: string, title: string): HTMLElement[] {
+  return [
+    el("label", { class: "muted", htmlFor: id, title }, label),
+    el("input", { type: "text", id, value, title, onchange: changed }),
+  ];
+}
+const FILTER = "MATERIAL:MM beside the machine’s own, put there by hand: aluminium:1";
+const DETAIL = "What is to be seen on the darkest ray: MATERIAL:MM or void:MM";
+const WANTED = "Contrast to noise of the detail that is wished for";
 const facts = el("div", { id: "design-facts", class: "small-text", "aria-live": "polite" });
 const chart = el("canvas", {
   id: "design-chart",
   role: "img",
   "aria-label": "Predicted histogram of transmission",
 });
-const card = el(
-  "details",
-  {
-    id: "designer",
-    ontoggle: () => {
-      if (card.open) void begin();
-    },
-  },
-  el("summary", {}, "Design a scan"),
-  el(
-    "div",
-    { class: "form" },
-    ...BARS.flatMap(row),
-    ...word(
-      "design-filter",
-      "filter",
-      "",
-      "MATERIAL:MM beside the machine’s own, put there by hand: aluminium:1",
-    ),
-    ...word(
-      "design-detail",
-      "detail",
-      "void:0.5",
-      "What is to be seen on the darkest ray: MATERIAL:MM or void:MM",
-    ),
-    ...word(
-      "design-cnr",
-      "CNR wanted",
-      "5",
-      "Contrast to noise of the detail that is wished for",
-    ),
-  ),
-  chart,
-  facts,
+const form = el(
+  "div",
+  { class: "form" },
+  ...BARS.flatMap(bar),
+  ...word("design-filter", "filter", "", FILTER),
+  ...word("design-detail", "detail", "void:0.5", DETAIL),
+  ...word("design-cnr", "CNR wanted", "5", WANTED),
 );
+const opened = () => {
+  if (card.open) void begin();
+};
+const card = el("details", { id: "designer", ontoggle: opened });
+card.append(el("summary", {}, "Design a scan"), form, chart, facts);
 export const place = (node: HTMLElement): void => node.append(card);
 
-export function value(name: Bar): number {
-  const [low, high, log] = scales[name] ?? [0, 1, false],
-    t = Number(inputs[name].value) / 1000;
-  const v = log ? low * (high / low) ** t : low + t * (high - low);
-  return name === "voxel_um" ? v : Math.round(v);
+function value(name: Bar): number {
+  const { low, high, log } = scales[name] ?? { low: 0, high: 1, log: false };
+  const part = Number(inputs[name].value) / BAR_STEPS;
+  const exact = log ? low * (high / low) ** part : low + part * (high - low);
+  return name === "voxel_um" ? exact : Math.round(exact);
 }
-function put(name: Bar, v: number) {
-  const [low, high, log] = scales[name] ?? [0, 1, false],
-    t = log ? Math.log(v / low) / Math.log(high / low) : (v - low) / (high - low);
-  inputs[name].value = String(1000 * Math.min(1, Math.max(0, t)));
+function put(name: Bar, to: number): void {
+  const { low, high, log } = scales[name] ?? { low: 0, high: 1, log: false };
+  const part = log ? Math.log(to / low) / Math.log(high / low) : (to - low) / (high - low);
+  inputs[name].value = String(BAR_STEPS * Math.min(1, Math.max(0, part)));
   inputs[name].dispatchEvent(new Event("input"));
 }
-// What a script is to have; nothing while the designer is closed.
-const wished = () =>
+const begun = () => scales.kV !== undefined;
+const bySliders = () =>
   Object.fromEntries(BARS.map(([name]) => [name, value(name)])) as Record<Bar, number>;
+// What a script is to have beside the wished scan; nothing while the designer is closed.
 export const wish = (): Partial<Record<Bar, number>> =>
-  card.open && scales.kV ? wished() : {};
+  card.open && begun() ? bySliders() : {};
 
-async function begin() {
-  if (scales.kV || !store.state) return;
-  const { tube, camera } = store.state;
-  const limits = await call("viewer.spectrum", { kV: tube.kV }).then(
-    (s) => s.limits,
-    () => null,
-  );
-  if (!limits) return;
-  Object.assign(scales, {
-    kV: [...limits.kV, false],
-    power_W: [1, limits.power_W[1], false],
-    exposure_ms: [...limits.exposure_ms, true],
-    frames: [2, 3600, true],
-  } satisfies Partial<Record<Bar, Scale>>);
-  const start: Partial<Record<Bar, number>> = {
-    kV: tube.kV,
-    power_W: tube.power_W,
-    exposure_ms: camera.exposure_ms,
-    frames: $input("#wish-frames").valueAsNumber || 361,
-  };
-  for (const [name, v] of Object.entries(start)) put(name as Bar, v);
+async function begin(): Promise<void> {
+  if (begun() || !store.state) return;
+  const { tube } = store.state;
+  const spectrum = await call("viewer.spectrum", { kV: tube.kV }).catch(() => null);
+  if (!spectrum) return;
+  const { kV, power_W, exposure_ms: exposures } = spectrum.limits;
+  longest_ms = exposures[1];
+  scales.kV = { low: kV[0], high: kV[1], log: false };
+  scales.power_W = { low: 1, high: power_W[1], log: false };
+  put("kV", tube.kV);
+  put("power_W", tube.power_W);
   scaleVoxels();
   void predict();
 }
 // Voxels are pixels of the mode that is set, at the distances that stand.
-let pixel = 0;
-function scaleVoxels() {
+let pixel_um = 0;
+function scaleVoxels(): void {
   if (!store.state) return;
-  const { camera, geometry: g } = store.state;
-  pixel = 1000 * camera.pixel_mm;
-  scales.voxel_um = [pixel / 20, pixel, true];
-  put("voxel_um", (pixel * g.SOD_mm) / g.SDD_mm);
+  const { camera, geometry } = store.state;
+  pixel_um = 1000 * camera.pixel_mm;
+  scales.voxel_um = { low: pixel_um / VOXEL_RANGE, high: pixel_um, log: true };
+  put("voxel_um", (pixel_um * geometry.SOD_mm) / geometry.SDD_mm);
 }
-let due: number | undefined,
-  number = 0;
-function changed() {
-  $input("#wish-frames").value = String(value("frames"));
-  $input("#wish-exposure").value = String(value("exposure_ms"));
+let due: number | undefined;
+let number = 0;
+function changed(): void {
   clearTimeout(due);
   due = window.setTimeout(() => {
     emit("design");
     void predict();
   }, SETTLE_MS);
 }
-async function predict() {
-  if (!store.state) return;
-  const mine = ++number,
-    { geometry: g, camera, sample } = store.state,
-    w = wished();
-  setText(facts, `predicting a scan of ${sample.name || "nothing"} …`);
+effect(() => {
+  kind.get();
+  frames.get();
+  exposure_ms.get();
+  if (card.open && begun()) changed();
+});
+
+// What a prediction is made of, beside the wish.
+const made = (): Fingerprint =>
+  store.now ? only(store.now, "twin", "machine", "sample", "placement", "correction") : {};
+let predicted: Fingerprint | null = null;
+let panel = "";
+
+interface Asked extends Record<Bar, number> {
+  exposure_ms: number;
+}
+async function predict(): Promise<void> {
+  const state = store.state;
+  if (!state) return;
+  const mine = ++number;
+  const scan = wishedScan();
+  if (typeof scan === "string") {
+    fail(scan);
+    return;
+  }
+  predicted = made();
+  const { geometry: g, camera } = state;
+  const bars = bySliders();
+  setText(facts, `predicting a scan of ${sampleOf(predicted) || "nothing"} …`);
+  const sod_mm = (bars.voxel_um / 1000 / camera.pixel_mm) * g.SDD_mm;
   const asked = {
-    kV: w.kV,
-    power_W: w.power_W,
-    exposure_ms: w.exposure_ms,
-    frames: w.frames,
-    kind: $select("#wish-kind").value as Compose["kind"],
+    ...scan,
+    kV: bars.kV,
+    power_W: bars.power_W,
     averages: 1,
     filter: $input("#design-filter").value.trim(),
     detail: $input("#design-detail").value.trim(),
     sdd_mm: Number(g.SDD_mm.toFixed(4)),
-    sod_mm: Number(((w.voxel_um / 1000 / camera.pixel_mm) * g.SDD_mm).toFixed(4)),
+    sod_mm: Number(sod_mm.toFixed(4)),
   };
-  let p: ExposurePrediction;
-  try {
-    p = await call("exposure.predict", asked);
-  } catch (error) {
-    if (mine === number) {
-      setText(facts, words(error));
-      chart.hidden = true;
-    }
-    return;
-  }
+  const p = await call("exposure.predict", asked).catch(words);
   if (mine !== number) return;
-  const cnr = p.asked.cnr ?? 0,
-    goal = Number($input("#design-cnr").value),
-    ms = w.exposure_ms * (goal / cnr) ** 2,
-    best = p.best.at(0),
-    enough = cnr * LATEST >= goal;
-  const part = (v: number) => `${fixed(100 * v, v && v < 0.1 ? 1 : 0)} %`,
-    line = (id: string, ...nodes: Array<Node | string | null>) =>
-      el("div", { id: `design-${id}` }, ...nodes);
-  // Noise of photons goes with the root of the time, what the panel adds falls faster.
-  const other = best && (best.kV !== w.kV || best.filter !== p.asked.filter);
-  const reach = {
-    class: "small",
-    id: "design-reach",
-    onclick: () => {
-      put("exposure_ms", ms);
-      changed();
-    },
-  };
+  if (typeof p === "string") fail(p);
+  else show(p, { ...bars, exposure_ms: scan.exposure_ms });
+}
+function fail(why: string): void {
+  setText(facts, why);
+  chart.hidden = true;
+}
+
+const part = (v: number) => `${fixed(100 * v, v && v < 0.1 ? 1 : 0)} %`;
+function show(p: ExposurePrediction, asked: Asked): void {
+  const line = (id: string, ...nodes: Array<Node | string | null>) =>
+    el("div", { id: `design-${id}` }, ...nodes);
+  const dose = `${fixed(p.asked.kerma_mGy, 2)} mGy on the axis`;
+  const dark = `least transmission ${part(p.transmission.least)}`;
+  const ends = `saturated ${part(p.saturated)} · starved ${part(p.starved)}`;
   facts.replaceChildren(
-    line(
-      "time",
-      `${seconds(p.seconds)} · ${bytes(p.bytes)} · ${fixed(p.asked.kerma_mGy, 2)} mGy on the axis`,
-    ),
-    line(
-      "least",
-      `least transmission ${part(p.transmission.least)} · saturated ${part(p.saturated)} · starved ${part(p.starved)}`,
-    ),
-    line(
-      "quality",
-      `contrast to noise of ${p.detail}: `,
-      el(
-        "b",
-        { class: `verdict ${enough ? "ok" : "bad"}` },
-        p.asked.cnr === null ? "saturated" : fixed(cnr, 2),
-      ),
-      " ",
-      enough || !(goal > 0) || p.asked.cnr === null
-        ? null
-        : ms <= (scales.exposure_ms?.[1] ?? 0)
-          ? el("button", reach, `${fixed(goal, 1)} takes ${fixed(Math.ceil(ms), 0)} ms at most`)
-          : `no exposure reaches ${fixed(goal, 1)}`,
-    ),
-    line(
-      "best",
-      other
-        ? `best at ${fixed(best.kV, 0)} kV${best.filter ? `, ${best.filter}` : ""}: ${fixed(best.cnr ?? 0, 2)}`
-        : "",
-      ...p.assumed.map((a) => ` · ${a}`),
-    ),
+    line("time", `${seconds(p.seconds)} · ${bytes(p.bytes)} · ${dose}`),
+    line("least", `${dark} · ${ends}`),
+    line("quality", `contrast to noise of ${p.detail}: `, ...quality(p, asked)),
+    line("best", best(p, asked), ...p.assumed.map((a) => ` · ${a}`)),
   );
   draw(p.transmission);
 }
-function draw({ edges, shares }: TransmissionShares) {
+// Contrast to noise, and the exposure that would reach the wished one: noise of photons goes with
+// the root of the time, what the panel adds falls faster.
+function quality({ asked: { cnr } }: ExposurePrediction, asked: Asked): Array<Node | string> {
+  const goal = Number($input("#design-cnr").value);
+  const enough = cnr !== null && cnr * CNR_TOLERANCE >= goal;
+  const said = cnr === null ? "saturated" : fixed(cnr, 2);
+  const verdict = el("b", { class: `verdict ${enough ? "ok" : "bad"}` }, said);
+  if (enough || !(goal > 0) || cnr === null) return [verdict];
+  const ms = Math.ceil(asked.exposure_ms * (goal / cnr) ** 2);
+  if (ms > longest_ms) return [verdict, ` no exposure reaches ${fixed(goal, 1)}`];
+  const reach = { class: "small", id: "design-reach", onclick: () => setExposure(ms) };
+  return [verdict, " ", el("button", reach, `${fixed(goal, 1)} takes ${ms} ms at most`)];
+}
+function best({ best: settings, asked: own }: ExposurePrediction, asked: Asked): string {
+  const first = settings.at(0);
+  if (!first || (first.kV === asked.kV && first.filter === own.filter)) return "";
+  const filter = first.filter ? `, ${first.filter}` : "";
+  return `best at ${fixed(first.kV, 0)} kV${filter}: ${fixed(first.cnr ?? 0, 2)}`;
+}
+function draw({ edges, shares }: TransmissionShares): void {
   chart.hidden = false;
-  const room = cleared(chart),
-    style = getComputedStyle(chart);
-  bars(
-    room,
-    shares.map((share) => 1000 * share),
-    (k) => {
-      room[0].fillStyle = style.getPropertyValue(edges[k] < 0.02 ? "--warn" : "--accent");
-    },
-  );
+  const room = cleared(chart);
+  const style = getComputedStyle(chart);
+  const counts = shares.map((share) => 1000 * share);
+  bars(room, counts, (k) => {
+    const colour = edges[k] < DARK_TRANSMISSION ? "--warn" : "--accent";
+    room[0].fillStyle = style.getPropertyValue(colour);
+  });
 }
 on("state", (s) => {
-  if (!scales.kV) return;
-  const now = JSON.stringify([s.sample.name, s.sample.revision, s.geometry.SDD_mm.toFixed(1)]),
-    seen = JSON.stringify([s.camera.mode, s.camera.roi]);
-  if (pixel !== 1000 * s.camera.pixel_mm) scaleVoxels();
+  if (!begun()) return;
+  const seen = JSON.stringify([s.camera.mode, s.camera.roi, s.geometry.SDD_mm.toFixed(1)]);
+  if (pixel_um !== 1000 * s.camera.pixel_mm) scaleVoxels();
+  const other = predicted ? differences(predicted, made()) : [];
   if (card.open && panel && seen !== panel) changed();
-  else if (card.open && now !== stood) void predict();
-  stood = now;
+  else if (card.open && other.length) void predict();
+  else if (other.length) setText(facts, `made for another ${listed(other)}`);
   panel = seen;
-});
-let stood = "",
-  panel = "";
-$input("#wish-kind").addEventListener("change", () => {
-  if (card.open && scales.kV) changed();
 });

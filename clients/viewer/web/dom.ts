@@ -1,4 +1,9 @@
 // Small helpers for building the page.
+import { parsed } from "./figures.js";
+import { plain } from "./names.js";
+
+export { bytes, fixed, isNumber, parsed, seconds } from "./figures.js";
+
 export const $ = <E extends Element = HTMLElement>(
   selector: string,
   root: ParentNode = document,
@@ -41,11 +46,13 @@ export function el<T extends keyof HTMLElementTagNameMap>(
     if (typeof value === "function")
       node.addEventListener(name.slice(2), value as EventListener);
     else if (name === "class") node.className = String(value);
+    else if (name === "title") node.title = plain(String(value));
     else if (name in node && name !== "list")
       (node as unknown as Record<string, unknown>)[name] = value;
     else node.setAttribute(name, String(value));
   }
-  node.append(...children.filter((c) => c !== null && c !== undefined));
+  const given = children.filter((c) => c !== null && c !== undefined);
+  node.append(...given.map((c) => (typeof c === "string" ? plain(c) : c)));
   return node;
 }
 // Id of a button -> what it does.
@@ -63,17 +70,6 @@ export function pressed(f: () => unknown) {
       if (e.key === "Enter" && !e.repeat) f();
     },
   };
-}
-export function fixed(value: number | null | undefined, digits = 2): string {
-  if (!isNumber(value)) return "–";
-  const text = value.toFixed(digits);
-  return Number(text) === 0 ? text.replace("-", "") : text;
-}
-export const isNumber = (value: unknown): value is number => Number.isFinite(value);
-// The number a person typed: a decimal comma is a point, and what is no number is none (never 0).
-export function parsed(text: string): number {
-  const plain = text.trim().replace("−", "-").replace(",", ".");
-  return /^[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?$/i.test(plain) ? Number(plain) : NaN;
 }
 // A field for a number (as text: browsers drop what they cannot read from number fields without a word).
 // What is typed is marked until Enter applies it or Escape takes it back.
@@ -113,28 +109,9 @@ export function numeric(
   });
   return input;
 }
-export function seconds(s: number | null | undefined): string {
-  if (!isNumber(s)) return "–";
-  s = Math.round(s);
-  const h = Math.floor(s / 3600),
-    m = Math.floor((s % 3600) / 60);
-  return h
-    ? `${h} h ${String(m).padStart(2, "0")} min`
-    : m
-      ? `${m} min ${String(s % 60).padStart(2, "0")} s`
-      : `${s} s`;
-}
-export function bytes(n: number): string {
-  const units = ["B", "kB", "MB", "GB", "TB"];
-  let i = 0;
-  while (n >= 1000 && i < 4) {
-    n /= 1000;
-    i++;
-  }
-  return `${n.toFixed(i ? 1 : 0)} ${units[i]}`;
-}
 export function setText(node: Element, text: string): void {
-  if (node.textContent !== text) node.textContent = text;
+  const shown = plain(text);
+  if (node.textContent !== shown) node.textContent = shown;
 }
 export function download(url: string, name: string): void {
   const a = el("a", { href: url, download: name });

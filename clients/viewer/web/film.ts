@@ -84,11 +84,11 @@ function develop(i: Shown) {
 }
 
 // An image taken with the beam off says so: it is dark, or drawn as though the beam were on.
-function unlit(i: Shown | null) { const tube = store.state?.tube; return i !== null && !i.recorded && tube !== undefined && !(tube.on && tube.ready); }
+const unlit = (i: Shown | null) => i !== null && !i.recorded && i.origin?.lit === false;
 function beam(i: Shown | null) {
   const tube = store.state?.tube, off = unlit(i);
   $("#film-beam").hidden = !off;
-  if (off) setText($("#film-beam"), tube?.on ? "X-rays warming up" : i?.kind === "counts" ? "X-rays off: dark image" : "X-rays off: drawn as though on");
+  if (off) setText($("#film-beam"), tube?.on && !tube.ready ? "X-rays warming up" : i?.kind === "counts" ? "X-rays off: dark image" : "X-rays off: drawn as though on");
 }
 // The part of the beam that comes through: from the thickest place (all but one in a hundred let more through) on.
 function transmission(i: Shown) {

@@ -1,6 +1,15 @@
 // The page's connection to its viewer: requests with answers, newest states and images, how old they are,
 // reconnection.
 import { keep, words } from "./dom.js";
+import {
+  differences,
+  ofData,
+  ofImage,
+  ofNow,
+  type Fingerprint,
+  type Quantities,
+  type Quantity,
+} from "./fingerprint.js";
 import type {
   Answers,
   Camera,
@@ -41,7 +50,9 @@ export const store = {
   received: { state: 0, image: 0 },
   age: 0,
   fresh: null as number | null,
+  now: null as Quantities | null,
   imageAge: 0,
+  imageDiffers: [] as Quantity[],
   job: null as JobStatus | null,
   refused: null as string | null,
   problem: null as string | null,
@@ -167,6 +178,7 @@ const handlers: { [T in keyof Messages]: (m: Messages[T]) => void } = {
       coneVec: m.cone_vec,
     });
     store.received.state++;
+    store.now = ofNow(m.state, m.cone_vec, store.hello);
     if (!store.twin) {
       store.twin = true;
       emit("connection");
@@ -182,6 +194,7 @@ const handlers: { [T in keyof Messages]: (m: Messages[T]) => void } = {
       cameras: m.cameras,
     });
     store.hello = m.hello ?? store.hello;
+    if (store.state) store.now = ofNow(store.state, store.coneVec, store.hello);
     emit("connection");
   },
   session(m) {
@@ -232,15 +245,22 @@ function late(sent: number) {
   return now - sent - least.lag;
 }
 let differs: number | null = null;
+// What an image that the page has was made of.
+export function imageMade(
+  image: Pick<Shown, "recorded" | "origin" | "cone_vec" | "twin">,
+): Fingerprint {
+  const { recorded } = image;
+  if (recorded) return ofData(recorded.name, recorded.index);
+  return ofImage(image.origin, image.cone_vec, image.twin);
+}
 function look() {
   const now = performance.now();
   store.age = heard === null ? 0 : (now - heard.at) / 1000 + heard.late + heard.silent;
   store.fresh = store.age > OLD_S ? null : (store.fresh ?? now);
-  // An image of another pose than the state's is old, once none has come for a while.
-  const i = store.image,
-    c = store.coneVec;
-  const apart =
-    i && !i.recorded && c && i.cone_vec.some((v, k) => Math.abs(v - c[k]) > 1e-3) ? i : null;
+  // An image of other things than the state's is old, once none has come for a while.
+  const image = store.image;
+  store.imageDiffers = image && store.now ? differences(imageMade(image), store.now) : [];
+  const apart = image && store.imageDiffers.length && !image.recorded ? image : null;
   differs = apart ? (differs ?? now) : null;
   store.imageAge =
     apart && differs !== null ? (now - Math.max(differs, apart.at_ms)) / 1000 : 0;

@@ -14,6 +14,7 @@ import {
   keep,
   numeric,
   parsed,
+  setText,
   words,
 } from "./dom.js";
 import type {
@@ -25,6 +26,7 @@ import type {
   State,
   UploadResult,
 } from "./viewer.js";
+import { differences, listed, only, type Fingerprint } from "./fingerprint.js";
 import { call, command, emit, on, store } from "./link.js";
 
 const CHUNK = 3 << 20;
@@ -267,35 +269,36 @@ const PHYSICS: Record<string, string> = {
   mono: "Photons of one energy, as many as the spectrum below would make visible: voltage changes brightness and noise, not contrast.",
   poly: "Photons of all energies below, through the filters: voltage changes contrast, brightness and noise.",
 };
-async function predict() {
-  if (!store.state) return;
-  const now = predictable(store.state);
+// What a prediction is made of; it goes with that.
+const predictable = (): Fingerprint =>
+  store.now ? only(store.now, "twin", "machine", "sample", "tube", "camera", "distances") : {};
+let predicted: Fingerprint | null = null;
+async function predict(): Promise<void> {
+  const made = predictable();
   predicted = null;
   $button("#predict").disabled = true;
-  $("#predicted").textContent = "a few seconds …";
+  setText($("#predicted"), "a few seconds …");
   const p = await command("exposure.predict", {}, "No prediction");
   $button("#predict").disabled = false;
-  const setting = (s: PredictedSetting) =>
-    `${fixed(s.kV, 0)} kV${s.filter ? ` ${s.filter}` : ""}: ${s.cnr === null ? "saturated" : fixed(s.cnr, 1)}`;
-  const told = (p: ExposurePrediction) => [
-    `contrast to noise of ${p.detail}: ${setting(p.asked)}`,
-    ...p.best.slice(0, 1).map((s) => `best ${setting(s)}`),
-    `1 % of the pixels see ${fixed(100 * p.transmission.p1, 1)} % or less`,
-  ];
-  $("#predicted").textContent = p ? told(p).join(" · ") : "";
-  if (p) predicted = now;
+  setText($("#predicted"), p ? predictionWords(p) : "");
+  if (p) predicted = made;
 }
-// What a prediction was made for; it goes with that.
-let predicted: string | null = null;
-const predictable = ({ sample, tube, camera, geometry: g }: State) =>
-  JSON.stringify([
-    sample,
-    tube.kV,
-    tube.power_W,
-    camera,
-    g.SOD_mm.toFixed(2),
-    g.SDD_mm.toFixed(2),
-  ]);
+function predictionWords(p: ExposurePrediction): string {
+  const told = [`contrast to noise of ${p.detail}: ${setting(p.asked)}`];
+  if (p.best.length) told.push(`best ${setting(p.best[0])}`);
+  told.push(`1 % of the pixels see ${fixed(100 * p.transmission.p1, 1)} % or less`);
+  return told.join(" · ");
+}
+function setting({ kV, filter, cnr }: PredictedSetting): string {
+  const quality = cnr === null ? "saturated" : fixed(cnr, 1);
+  return `${fixed(kV, 0)} kV${filter ? ` ${filter}` : ""}: ${quality}`;
+}
+function outdatePrediction(): void {
+  const differ = predicted ? differences(predicted, predictable()) : [];
+  if (!differ.length) return;
+  predicted = null;
+  setText($("#predicted"), `made for another ${listed(differ)}: predict again`);
+}
 let spectrumOf: number | null = null;
 async function spectrum(kV: number) {
   if (spectrumOf === kV || $("#tab-setup").hidden) return;
@@ -335,15 +338,11 @@ on("tab", () => {
 on("session", () => {
   spectrumOf = null;
 });
-let listed: string | null | undefined;
+let listedFor: string | null | undefined;
 on("session", list);
 on("state", show);
 function show(state: State) {
-  if (predicted !== null && predicted !== predictable(state)) {
-    predicted = null;
-    $("#predicted").textContent =
-      "sample, beam, camera or distances have changed: predict again";
-  }
+  outdatePrediction();
   void spectrum(state.tube.kV);
   put("kV", state.tube.kV, 2);
   put("power", state.tube.power_W, 2);
@@ -365,8 +364,8 @@ function show(state: State) {
   $("#sample-note").textContent = s.size_mm
     ? s.size_mm.map((v) => fixed(v, 1)).join(" × ") + " mm"
     : "";
-  if (listed !== s.name) {
-    listed = s.name;
+  if (listedFor !== s.name) {
+    listedFor = s.name;
     void list();
   }
 }

@@ -1,5 +1,5 @@
 // What the viewer says beside the wire: its messages, its own methods' answers, and what the page makes of them.
-import type { CalibrationFitResult, CheckStep, DatasetListResult, DatasetResult, Estimated, GeometryState, HelloResult, ImageFlags, JobStatus, Mark, Methods, State } from "./wire.js";
+import type { CalibrationFitResult, CheckStep, DatasetListResult, DatasetResult, Estimated, GeometryState, HelloResult, ImageFlags, ImageOrigin, JobStatus, Mark, Methods, State } from "./wire.js";
 
 export type * from "./wire.js";
 
@@ -15,10 +15,10 @@ export interface Framing { width: number; height: number; left: number; top: num
 export interface Near { mm: number | null; pair: string[]; close: boolean }
 
 // A recorded image, and what cannot be said of it.
-export interface AboutImage { name: string; index: number; file: string; image: "dark" | "flat" | "projection"; projection: number | null; time_s: number | null; positions: Record<string, number> | null; problem: string; geometry: GeometryState | null; tube: { kV: number | null; power_W: number | null; on: boolean } | null }
+export interface AboutImage { name: string; index: number; file: string; image: "dark" | "flat" | "projection"; projection: number | null; time_s: number | null; positions: Record<string, number> | null; problem: string; geometry: GeometryState | null; tube: { kV: number | null; power_W: number | null; on: boolean } | null; virtual_origin?: ImageOrigin | null }
 export interface ImageHead {
   kind: Kind; code: "jpeg" | "deflate"; shape: Pair; pair: boolean; full: Pair; low: number; scale: number; time: number; cone_vec: number[]; seq: number;
-  flags: ImageFlags | null; window: Pair; beads: Pair[]; at: number; recorded?: AboutImage;
+  flags: ImageFlags | null; origin: ImageOrigin | null; twin: string; window: Pair; beads: Pair[]; at: number; recorded?: AboutImage;
 }
 // An image as the page shows it: `signed` is a difference `of` one image `from` the pixels of another.
 export interface Shown extends ImageHead {
@@ -85,7 +85,7 @@ export interface Answers extends WireAnswers {
 export interface Events {
   note: [level: string, title: string, body?: string];
   connection: []; open: []; session: []; layers: []; age: []; compare: []; design: [];
-  state: [state: State]; job: [job: JobStatus]; volume: [volume: VolumeMessage]; image: [image?: Shown | null];
+  state: [state: State]; job: [job: JobStatus]; scan: [fresh: boolean]; volume: [volume: VolumeMessage]; image: [image?: Shown | null];
   log: [entry: { level: string; message: string }];
   tab: [name: string]; "show-tab": [name: string]; recorded: [name: string | null]; frame: [target: Window];
   calibrate: [dataset: string, sample: string, markers?: Mark[]]; align: [dataset: string]; reconstruct: [dataset: string]; script: [text: string];

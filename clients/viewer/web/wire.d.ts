@@ -41,7 +41,7 @@ export type CameraState = {
 export type CheckCollision = { line: number | null; time_s: number; pair: Array<string> };
 export type CheckResult = {
   ok: boolean; problems: Array<Problem>; steps: Array<CheckStep>; duration_s: number; frames: number; bytes: number;
-  collisions: Array<CheckCollision>; min_clearance_mm: number | null
+  collisions: Array<CheckCollision>; min_clearance_mm: number | null; min_clearance_pair: Array<string> | null
 };
 export type CheckStep = { line: number | null; start_s: number; duration_s: number; what: string };
 export type ClockState = { time_s: number; speed_up: number | "max"; real_time_factor: number | null };
@@ -99,11 +99,16 @@ export type GeometryState = {
 };
 export type HelloResult = {
   protocol: string; server: string; machine: string; profile: string | null; session: string | null;
-  physics: string | null
+  physics: string | null; instance: string | null
 };
 export type ImageFlags = {
   time: number | null; saturated: number; starved: number; truncated: Array<"left" | "right" | "top" | "bottom">;
   good_counts: [number, number] | null; good_lines: [number, number] | null
+};
+export type ImageOrigin = {
+  sample: string | null; revision: string | null; material: string | null; offset: SamplePlacement; lit: boolean;
+  kV: number; power_W: number; mode: string; exposure_ms: number; averages: number;
+  roi: [number, number, number, number]; correction: string | null
 };
 export type ImageValue = { shape: Array<number>; data: string };
 export type JobAbort = { job?: string | null; reason?: string | null };
@@ -115,7 +120,8 @@ export type JobStatus = {
   job: string; state: "queued" | "running" | "paused" | "done" | "failed" | "aborted" | "incomplete"; name: string;
   dataset: string | null; frames_done: number; frames_total: number; elapsed_s: number; remaining_s: number | null;
   time: number; speed_up: number | "max"; real_time_factor: number | null; error: Record<string, unknown> | null;
-  warnings: Array<string>; step: number | null; line: number | null; what: string; start: Record<string, number> | null
+  warnings: Array<string>; step: number | null; line: number | null; what: string; ended_by: string | null;
+  start: Record<string, number> | null
 };
 export type Jog = { axis: string; velocity: number; lease_s?: number };
 export type JsonValue = unknown;
@@ -188,12 +194,12 @@ export type Spectrum = { kV: number };
 export type State = {
   time: number; axes: Record<string, AxisState>; tube: TubeState; camera: CameraState; sample: SampleState;
   geometry: GeometryState; safety: SafetyState; job: JobStatus | null; correction: Correction | null; clock: ClockState;
-  controller: string | null; image: ImageFlags | null; unsaved: string | null
+  controller: string | null; image: ImageFlags | null; unsaved: string | null; projector: string | null
 };
 export type Stopped = {
   time: number; axes: Record<string, AxisState>; tube: TubeState; camera: CameraState; sample: SampleState;
   geometry: GeometryState; safety: SafetyState; job: JobStatus | null; correction: Correction | null; clock: ClockState;
-  controller: string | null; image: ImageFlags | null; unsaved: string | null
+  controller: string | null; image: ImageFlags | null; unsaved: string | null; projector: string | null
 };
 export type SubmitResult = { job: string; dataset: string | null; warnings: Array<string> };
 export type Theme = { dark?: boolean; fine?: boolean };

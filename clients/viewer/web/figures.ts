@@ -1,0 +1,36 @@
+// Numbers in words, and words as numbers.
+export const isNumber = (value: unknown): value is number => Number.isFinite(value);
+
+export function fixed(value: number | null | undefined, digits = 2): string {
+  if (!isNumber(value)) return "–";
+  const text = value.toFixed(digits);
+  return Number(text) === 0 ? text.replace("-", "") : text;
+}
+
+export function seconds(s: number | null | undefined): string {
+  if (!isNumber(s)) return "–";
+  s = Math.round(s);
+  const h = Math.floor(s / 3600),
+    m = Math.floor((s % 3600) / 60);
+  return h
+    ? `${h} h ${String(m).padStart(2, "0")} min`
+    : m
+      ? `${m} min ${String(s % 60).padStart(2, "0")} s`
+      : `${s} s`;
+}
+
+export function bytes(n: number): string {
+  const units = ["B", "kB", "MB", "GB", "TB"];
+  let i = 0;
+  while (n >= 1000 && i < 4) {
+    n /= 1000;
+    i++;
+  }
+  return `${n.toFixed(i ? 1 : 0)} ${units[i]}`;
+}
+
+// The number a person typed: a decimal comma is a point, and what is no number is none (never 0).
+export function parsed(text: string): number {
+  const bare = text.trim().replace("−", "-").replace(",", ".");
+  return /^[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?$/i.test(bare) ? Number(bare) : NaN;
+}

@@ -1,0 +1,173 @@
+// What an image, a report or a prediction was made of, and whether that is still so. Nothing else
+// decides what is "now", "old" or "of a data set": headings, marks and notes ask here.
+import type { HelloResult, ImageOrigin, State } from "./viewer.js";
+
+export type Value = string | number | boolean | null | readonly Value[];
+
+// Quantities by name; a thing has those that it depends on.
+export interface Quantities {
+  twin: Value;
+  machine: Value;
+  dataset: Value;
+  frame: Value;
+  sample: Value;
+  placement: Value;
+  pose: Value;
+  motors: Value;
+  distances: Value;
+  camera: Value;
+  tube: Value;
+  lit: Value;
+  correction: Value;
+}
+export type Quantity = keyof Quantities;
+export type Fingerprint = Partial<Quantities>;
+
+export const WORDS: Record<Quantity, string> = {
+  twin: "run of the twin",
+  machine: "machine",
+  dataset: "data set",
+  frame: "image",
+  sample: "sample",
+  placement: "placement of the sample",
+  pose: "pose",
+  motors: "motor positions",
+  distances: "distances",
+  camera: "camera setting",
+  tube: "tube setting",
+  lit: "X-ray state",
+  correction: "correction",
+};
+const CONE_TOLERANCE_MM = 1e-3;
+const SHOWN_TOLERANCE = 5e-3; // mm or degrees: what the page shows of them
+const SETTING_TOLERANCE = 1e-6; // relative
+type Made = Pick<ImageOrigin, "mode" | "roi" | "exposure_ms" | "averages">;
+
+const placed = (o: State["sample"]["offset"]): Value => [o.x, o.y, o.z, o.rx, o.ry, o.rz];
+const content = (name: string | null, revision: string | null, material: string | null) => [
+  name || "empty",
+  revision,
+  name ? material : null,
+];
+const settings = (c: Made): Value => [c.mode, c.roi, c.exposure_ms, c.averages];
+
+// Everything that stands and is set now.
+export function ofNow(
+  state: State,
+  coneVec: readonly number[] | null,
+  hello: HelloResult | null,
+): Quantities {
+  const { sample, tube, camera, correction } = state;
+  return {
+    twin: hello?.instance ?? null,
+    machine: hello ? [hello.machine, hello.profile] : null,
+    dataset: null,
+    frame: null,
+    sample: content(sample.name, sample.revision, sample.material),
+    placement: placed(sample.offset),
+    pose: coneVec,
+    motors: Object.entries(state.axes)
+      .filter(([, axis]) => !axis.virtual)
+      .map(([name, axis]) => [name, axis.position]),
+    distances: [state.geometry.SOD_mm, state.geometry.SDD_mm],
+    camera: settings(camera),
+    tube: [tube.kV, tube.power_W],
+    lit: tube.on && tube.ready,
+    correction: correction?.name ?? null,
+  };
+}
+
+// A live image, or a virtual one: by what the twin says of it, and its geometry.
+export function ofImage(
+  origin: ImageOrigin | null,
+  coneVec: readonly number[] | null,
+  twin: string,
+): Fingerprint {
+  const pose = coneVec ? { pose: coneVec } : {};
+  if (origin === null) return { dataset: null, ...pose };
+  return {
+    ...(twin ? { twin } : {}),
+    ...pose,
+    dataset: null,
+    sample: content(origin.sample, origin.revision, origin.material),
+    placement: placed(origin.offset),
+    camera: settings(origin),
+    tube: [origin.kV, origin.power_W],
+    lit: origin.lit,
+    correction: origin.correction,
+  };
+}
+
+// What is of a data set: an image of it, or all of it.
+export const ofData = (dataset: string, frame: number | null = null): Fingerprint => ({
+  dataset,
+  frame,
+});
+
+export function only(of: Fingerprint, ...quantities: Quantity[]): Fingerprint {
+  return Object.fromEntries(quantities.filter((q) => q in of).map((q) => [q, of[q]]));
+}
+
+// The quantities that both have and in which they differ; of what is of a data set, just that.
+export function differences(made: Fingerprint, now: Fingerprint): Quantity[] {
+  const both = (Object.keys(WORDS) as Quantity[]).filter(
+    (q) => known(q, made) && known(q, now),
+  );
+  const differ = both.filter((q) => !same(q, made[q] ?? null, now[q] ?? null));
+  return differ.includes("dataset") ? ["dataset"] : differ;
+}
+
+function tolerance(quantity: Quantity, a: number, b: number): number {
+  if (quantity === "pose") return CONE_TOLERANCE_MM;
+  if (quantity === "motors" || quantity === "distances") return SHOWN_TOLERANCE;
+  return SETTING_TOLERANCE * Math.max(Math.abs(a), Math.abs(b));
+}
+
+// Nothing is said of a twin or a machine that has not introduced itself.
+function known(quantity: Quantity, of: Fingerprint): boolean {
+  if (!(quantity in of)) return false;
+  return of[quantity] !== null || (quantity !== "twin" && quantity !== "machine");
+}
+
+function same(quantity: Quantity, a: Value, b: Value): boolean {
+  if (Array.isArray(a) && Array.isArray(b)) {
+    return a.length === b.length && a.every((v: Value, k) => same(quantity, v, b[k] as Value));
+  }
+  if (typeof a !== "number" || typeof b !== "number") return a === b;
+  return Math.abs(a - b) <= tolerance(quantity, a, b);
+}
+
+export type About =
+  | { kind: "now" }
+  | { kind: "old"; differ: Quantity[] }
+  | { kind: "data set"; dataset: string; frame: number | null };
+
+// What something says of now: that it is so, that it is old, or that it is of a data set.
+export function about(made: Fingerprint, now: Fingerprint): About {
+  if (typeof made.dataset === "string") {
+    const frame = typeof made.frame === "number" ? made.frame : null;
+    return { kind: "data set", dataset: made.dataset, frame };
+  }
+  const differ = differences(made, now);
+  return differ.length ? { kind: "old", differ } : { kind: "now" };
+}
+
+// A heading in words: "Geometry now", "Geometry of scan-3, image 5".
+export function heading(title: string, a: About): string {
+  if (a.kind === "now") return `${title} now`;
+  if (a.kind === "old") return `${title} of another ${listed(a.differ)}`;
+  return `${title} of ${a.dataset}${a.frame === null ? "" : `, image ${a.frame + 1}`}`;
+}
+
+// Names of quantities in words: "pose", "sample and pose", "sample, tube setting and pose".
+export function listed(quantities: Quantity[]): string {
+  const words = quantities.map((q) => WORDS[q]);
+  const last = words.pop() ?? "";
+  return words.length ? `${words.join(", ")} and ${last}` : last;
+}
+
+// The sample's name in a fingerprint; "" where it is not known.
+export function sampleOf(made: Fingerprint): string {
+  const name = Array.isArray(made.sample) ? (made.sample[0] as Value) : null;
+  return typeof name === "string" ? name : "";
+}

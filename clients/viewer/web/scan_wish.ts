@@ -1,0 +1,64 @@
+// What the next scan is wished to be: each quantity stands once, and has one field. The designer and
+// the script both read it here.
+import { $input, $select } from "./dom.js";
+import { batch, computed, effect, signal } from "./signals.js";
+import type { Compose } from "./viewer.js";
+import { on } from "./link.js";
+
+const FRAMES = 73;
+const EXPOSURE_MS = 100;
+type Kind = NonNullable<Compose["kind"]>;
+
+const typedExposure_ms = signal<number | null>(null);
+const cameraExposure_ms = signal(EXPOSURE_MS);
+export const kind = signal<Kind>("fly");
+export const frames = signal(FRAMES);
+// The camera's, until somebody types another one.
+export const exposure_ms = computed(() => typedExposure_ms.get() ?? cameraExposure_ms.get());
+
+const kindField = $select("#wish-kind");
+const framesField = $input("#wish-frames");
+const exposureField = $input("#wish-exposure");
+
+// The fields as they stand, whoever has written into them.
+function read(): void {
+  batch(() => {
+    kind.set(kindField.value as Kind);
+    frames.set(framesField.valueAsNumber);
+    const typed = exposureField.valueAsNumber;
+    if (!Object.is(typed, exposure_ms.get())) setExposure(typed);
+  });
+}
+export function setExposure(ms: number): void {
+  typedExposure_ms.set(ms);
+}
+for (const field of [kindField, framesField, exposureField])
+  field.addEventListener("input", read);
+exposureField.addEventListener("keydown", (e) => {
+  if (e.key === "Escape") typedExposure_ms.set(null);
+});
+effect(() => {
+  const ms = exposure_ms.get();
+  const shown = Number(ms.toFixed(3));
+  if (Number.isFinite(ms) && exposureField.valueAsNumber !== shown) {
+    exposureField.value = String(shown);
+  }
+  exposureField.classList.toggle("typed", typedExposure_ms.get() !== null);
+});
+on("state", ({ camera }) => {
+  cameraExposure_ms.set(camera.exposure_ms);
+});
+
+export interface Wish {
+  kind: Kind;
+  frames: number;
+  exposure_ms: number;
+}
+// The wish; what is no number of images or no exposure is said in words instead.
+export function wished(): Wish | string {
+  read();
+  if (!Number.isInteger(frames.get()) || frames.get() < 1)
+    return "frames: a whole number above 0";
+  if (!(exposure_ms.get() > 0)) return "ms: a number above 0";
+  return { kind: kind.get(), frames: frames.get(), exposure_ms: exposure_ms.get() };
+}
