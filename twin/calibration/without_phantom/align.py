@@ -157,6 +157,14 @@ def _warnings(plane: SymmetryPlane, turn: Turn, missing: int) -> tuple[str, ...]
             f"{plane.gap.text}: it is closed in what is told here, its uncertainty is in the axis "
             "column's sigma, and reconstruct closes it with the correction"
         )
+    hidden = plane.hidden
+    if hidden is not None and hidden.column_px > plane.column_sigma_px / 2:
+        out.append(
+            "the images do not exclude that a tile of the panel begins at columns "
+            f"{hidden.first} to {hidden.last} behind a gap, which would move the axis by half of "
+            f"its width: the column's sigma contains +- {hidden.column_px:.2g} px for it; "
+            "calibrate with a phantom, and give that correction"
+        )
     if turn.repeated:
         out.append(f"frames {list(turn.repeated)} repeat the one before and are left out")
     if missing:

@@ -55,6 +55,8 @@ LEAST_BINS: Final = 8
 """One bin of so many may be left out: where a wall turns back, more is wrong than elsewhere."""
 FEWEST_BINS: Final = 4
 """Bins that tell something, at least."""
+MOST_MOVED: Final = 0.1
+"""Part of the innermost bin that a step may move, at most: without a bin inside, it is a shift."""
 BEYOND, BESIDE = 3, 2
 """Whole bins beyond a step, at least, and beside it that are not left out."""
 WIDEST: Final = 5.0
@@ -139,7 +141,8 @@ class Profile:
             steps, rest = self._steps(widened)
             left_out = np.flatnonzero(np.isinf(sigma))
             clear = (np.abs(border[:, None] - left_out) > BESIDE).all(axis=1)
-            narrow = clear & np.array([abs(one.width) < WIDEST for one in steps])
+            narrow = clear & self._has_inside
+            narrow &= np.array([abs(one.width) < WIDEST for one in steps])
             if not narrow.any():
                 break
             ratio = np.where(narrow, [abs(one.width) / one.least for one in steps], 0.0)
@@ -151,9 +154,21 @@ class Profile:
         return max(found, key=lambda one: abs(one.width) / one.least)
 
     def at(self, radius: float) -> Step:
-        """Give the step at the radius next to one."""
+        """Give the step at the radius next to one; its sigma is inf where no bin lies inside."""
+        place = int(np.abs(self.radii - radius).argmin())
+        step = self.beside_axis(radius)
+        return step if self._has_inside[place] else step._replace(sigma=math.inf, least=math.inf)
+
+    def beside_axis(self, radius: float) -> Step:
+        """Give the step at the radius next to one, also where it is told from a shift of the axis
+        by the innermost bin alone, which what passes the axis itself moves."""
         place = int(np.abs(self.radii - radius).argmin())
         return self._steps(self._widened(self.sigma, place))[0][place]
+
+    @property
+    def _has_inside(self) -> npt.NDArray[np.bool_]:
+        """Whether the innermost bin lies inside of a step at each radius, (r,)."""
+        return np.asarray(self.basis[:, 0, 2] < MOST_MOVED)
 
     def _fit(self, sigma: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Fit steps: values (r, 3), their covariances, and what they leave in sigmas, (r, m)."""

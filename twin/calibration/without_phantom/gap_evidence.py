@@ -4,17 +4,19 @@ A wall that turns back at a column looks like a gap to single frames (`tile_gap.
 of the same rays (`conjugate_rays.py`) it does not. A gap is told where a step between their
 distances stands out from what the scan does at all other distances from the axis, or where the
 frames see a gap and the step there has its sign. Beside the axis, where no distance is inside
-of a step, what frames see counts by itself.
+of a step, what frames see counts by itself (`hidden_gap.py`), and what they neither show nor
+exclude is given beside the gap.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from flexdt.twin.calibration.without_phantom.conjugate_rays import ConjugateRays, Profile, Step
+from flexdt.twin.calibration.without_phantom.hidden_gap import HiddenGap, hidden_gap
 from flexdt.twin.calibration.without_phantom.tile_gap import Gap, local_gaps
 from flexdt.twin.errors import NotIdentifiableError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
@@ -25,12 +27,24 @@ ROUNDS: Final = 3
 """Times a gap is closed to see what is left of it."""
 
 
+class GapFound(NamedTuple):
+    """What a scan tells of a gap between two tiles.
+
+    Attributes:
+        gap: the gap; None: none is told.
+        hidden: what is left open about one beside the axis; None: nothing, or a gap is told.
+    """
+
+    gap: Gap | None
+    hidden: HiddenGap | None
+
+
 def find_gap(
     rays: ConjugateRays,
     values: FloatArray,
     frames: Sequence[Float32Array],
     closed: Sequence[float] = (),
-) -> Gap | None:
+) -> GapFound:
     """Find the gap between two tiles, if there is one.
 
     Args:
@@ -44,20 +58,23 @@ def find_gap(
     """
     values, sigma = rays.column(values)
     profile = rays.profile(values) if np.isfinite(sigma) else None
-    if profile is None:
-        return None
     axis = rays.scan.column(values, rays.row)
+    hidden = None if closed else hidden_gap(frames, axis, profile, rays.smoothing)
+    if profile is None:
+        return GapFound(None, hidden)
     seen = local_gaps(frames, axis, closed)
     certified = [gap for gap in seen if _certified(gap, profile, axis, rays.smoothing)]
+    if not certified and hidden is not None and hidden.likely is not None:
+        certified = [hidden.likely]
     step = profile.best()
     if not certified and not step.significant:
-        return None
+        return GapFound(None, hidden)
     first = certified[0] if certified else _from_step(step, axis)
     gap = _refined(rays, values, first)
     if not certified:  # the column is not known to the pixel
         gap = gap._replace(sigma=max(gap.sigma, first.sigma))
     if not certified and gap.width < SIGMAS * gap.sigma:
-        return None
+        return GapFound(None, hidden)
     others = [
         one
         for one in seen
@@ -65,7 +82,7 @@ def find_gap(
         and not _refuted(one, profile, axis)
     ]
     _require_one(rays, values, gap, others)
-    return gap
+    return GapFound(gap, None)
 
 
 def _certified(gap: Gap, profile: Profile, axis: float, smoothing: float) -> bool:

@@ -20,7 +20,8 @@ from flexdt.twin.calibration.without_phantom.circular_scan import (
     about_axis,
 )
 from flexdt.twin.calibration.without_phantom.conjugate_rays import ConjugateRays
-from flexdt.twin.calibration.without_phantom.gap_evidence import SIGMAS, find_gap
+from flexdt.twin.calibration.without_phantom.gap_evidence import SIGMAS, GapFound, find_gap
+from flexdt.twin.calibration.without_phantom.hidden_gap import HiddenGap
 from flexdt.twin.calibration.without_phantom.mirror_symmetry import (
     REACH,
     Symmetry,
@@ -129,6 +130,7 @@ class SymmetryPlane:
         gap: between two tiles of the panel.
         panel: the distortion that was undone, the gap in it.
         opposite: what opposite rays of a full turn say of the column.
+        hidden: what is left open about a gap beside the axis.
     """
 
     scan: CircularScan
@@ -142,6 +144,7 @@ class SymmetryPlane:
     gap: Gap | None
     panel: Panel | None
     opposite: OppositeColumn | None = None
+    hidden: HiddenGap | None = None
 
     @property
     def sigmas_deg(self) -> tuple[float, float]:
@@ -165,14 +168,14 @@ def find_plane(
     """
     first = _first_column(scan, random)
     _require_one_column(scan, first)
-    gap = _gap(scan, first, panel)
+    gap, hidden = _gap(scan, first, panel)
     whole, first = first, first if gap is None else _with_gap(first, gap)
     found = _fit(scan, first, gap)
     if gap is not None and _closes(found, gap):
         gap, first = None, whole
         found = _fit(scan, first, gap)
     _require_symmetric(found, first.preface)
-    plane = _plane(scan, first, found, gap, panel)
+    plane = _plane(scan, first, found, GapFound(gap, hidden), panel)
     _require_precise(plane, first.preface)
     return plane
 
@@ -238,10 +241,10 @@ def _require_one_column(scan: CircularScan, first: FirstColumn) -> None:
     )
 
 
-def _gap(scan: CircularScan, first: FirstColumn, panel: Panel | None) -> Gap | None:
+def _gap(scan: CircularScan, first: FirstColumn, panel: Panel | None) -> GapFound:
     """Look for a gap between two tiles that is not undone already."""
     if first.turn is None:
-        return None
+        return GapFound(None, None)
     borders = panel.model.borders if panel else ()
     closed = [b.at for b in borders if b.axis == 0]
     rays = ConjugateRays.of(scan, first.turn)
@@ -298,11 +301,12 @@ def _plane(
     scan: CircularScan,
     first: FirstColumn,
     found: Symmetry,
-    gap: Gap | None,
+    gap_found: GapFound,
     panel: Panel | None,
 ) -> SymmetryPlane:
     """Put together what was found, with the uncertainty that the fit does not contain."""
     turn, scales = first.turn, first.scales
+    gap, hidden = gap_found
     values, covariance = found.values.copy(), found.covariance.copy()
     if gap is not None and turn is not None:
         gap = gap._replace(width=float(values[-1]), sigma=float(np.sqrt(covariance[-1, -1])))
@@ -317,13 +321,14 @@ def _plane(
     step = (0.0, 0.0) if turn is None else turn.step_px
     opposite = _opposite_column(scan, first, values, covariance, gap)
     floor = opposite.floor_px if opposite else 0.0
-    covariance[0, 0] += (math.hypot(floor, step[0] / 2, beside) * scales[0]) ** 2
+    unseen = hidden.column_px if hidden else 0.0
+    covariance[0, 0] += (math.hypot(floor, step[0] / 2, beside, unseen) * scales[0]) ** 2
     covariance[1, 1] += math.radians(FLOOR_DEG) ** 2 + (step[0] / scan.shape[0]) ** 2
     slopes = scan.slopes(values, scales)
     sigma = math.sqrt(slopes @ covariance @ slopes)
     return SymmetryPlane(
         scan, turn, values, covariance, found.images[1:3], first.priors[1:3], told, sigma, gap,
-        panel, opposite,
+        panel, opposite, hidden,
     )  # fmt: skip
 
 

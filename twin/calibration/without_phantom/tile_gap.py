@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import maximum_filter1d, median_filter
+from scipy.special import ndtr
 
 from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
@@ -36,6 +37,8 @@ ROWS, FRAMES = 48, 96
 """Rows that a frame is averaged to, and frames that are looked at, where there are more."""
 EDGES: Final = 0.05
 """Part of all places that is compared, those with most change: edges. Noise says nothing."""
+LEAST_VARIANCE: Final = 0.02
+"""Of the largest variance of differences: what the model of normal differences may lack."""
 EVIDENCE, STANDS_OUT = 24.0, 5.0
 """Gain in log likelihood from which on there is a gap, and times the gain at any other border. Of
 93 drawn scans without a gap one had both, of 69 with one of 0.5 to 2 px 65 (`align_faults.py`)."""
@@ -113,9 +116,16 @@ def local_gaps(
     found = []
     for one in standing:
         width = float(WIDTHS[gains[:, one].argmax()])
-        # Sharper edges than the usual ones look like a wider gap: drawn ones are off by half of it.
-        found.append(Gap(one + SIDE, width, 0.2 + 0.3 * width))
+        found.append(Gap(one + SIDE, width, float(local_sigma(width))))
     return found
+
+
+def local_sigma(width: FloatArray | float) -> FloatArray:
+    """Give the standard deviation of a width that single frames show [px].
+
+    Sharper edges than the usual ones look like a wider gap: drawn ones are off by half of it.
+    """
+    return np.asarray(0.2 + 0.3 * np.asarray(width))
 
 
 def _gains(edges: FloatArray, place: npt.NDArray[np.intp], shape: tuple[int, int]) -> FloatArray:
@@ -126,17 +136,21 @@ def _gains(edges: FloatArray, place: npt.NDArray[np.intp], shape: tuple[int, int
         place: of each in a table of frames and borders, (k,).
         shape: of that table.
     """
-    of_distance = _differences(edges)
-    without, out = _likelihood(edges, of_distance, 0.0), []
+    of_distance = squares_by_distance(edges)
+    without, out = likelihood(edges, of_distance, 0.0), []
     for width in WIDTHS.tolist():
-        gain = _likelihood(edges, of_distance, width) - without
+        gain = likelihood(edges, of_distance, width) - without
         of_frames = np.bincount(place, gain, math.prod(shape)).reshape(shape)
         out.append(of_frames.sum(axis=0) - np.sqrt(np.square(of_frames).sum(axis=0)))
     return np.array(out)
 
 
-def _differences(edges: FloatArray) -> PchipInterpolator:
-    """Mean squares of the difference of two columns by their distance, 1 and more [px]."""
+def squares_by_distance(edges: FloatArray) -> PchipInterpolator:
+    """Give the mean square of the difference of two columns by their distance, 1 and more [px].
+
+    Args:
+        edges: differences of neighbouring columns, (k, 2 SIDE - 1).
+    """
     place = np.cumsum(np.pad(edges, ((0, 0), (1, 0))), axis=1)
     far = np.arange(1, 2 * SIDE)
     apart = np.array([np.square(place[:, h:] - place[:, :-h]).mean() for h in far.tolist()])
@@ -146,14 +160,25 @@ def _differences(edges: FloatArray) -> PchipInterpolator:
     )
 
 
-def _likelihood(edges: FloatArray, of_distance: PchipInterpolator, width: float) -> FloatArray:
-    """Logarithm of the likelihood of each row (k, 2 SIDE - 1) of differences of neighbours about a
-    gap of a width, at its own scale, (k,)."""
-    at = np.arange(2 * SIDE) + width * (np.arange(2 * SIDE) >= SIDE)
+def likelihood(
+    edges: FloatArray, of_distance: PchipInterpolator, width: float, blur: float = 0.0
+) -> FloatArray:
+    """Give the logarithm of the likelihood of each row of differences about a gap, (k,).
+
+    Args:
+        edges: differences of neighbouring columns, each row at its own scale, (k, 2 SIDE - 1).
+        of_distance: as `squares_by_distance` gives it.
+        width: of the gap [px].
+        blur: standard deviation over which the gap is smeared [px].
+    """
+    columns = np.arange(2 * SIDE)
+    beyond = columns - SIDE + 0.5
+    share = ndtr(beyond / blur) if blur > 0.0 else (beyond > 0.0).astype(np.float64)
+    at = columns + width * share
     distance = np.abs(at[:, None] - at)
     squares = np.where(distance > 0.0, of_distance(np.maximum(distance, 1.0)), 0.0)
     variance, ways = np.linalg.eigh(-0.5 * np.diff(np.diff(squares, axis=0), axis=1))
-    variance = np.maximum(variance, 1e-3 * variance[-1])
+    variance = np.maximum(variance, LEAST_VARIANCE * variance[-1])
     white = edges @ (ways / np.sqrt(variance))
     spread = np.log(np.square(white).sum(axis=1)) * (SIDE - 0.5)
     return np.asarray(-spread - float(np.log(variance).sum()) / 2)

@@ -1,0 +1,64 @@
+"""A gap beside the axis is told, excluded, or left in the sigma, by what single frames show of it.
+
+Frames of streaks that pass all columns, written out here, with and without a gap.
+"""
+
+from __future__ import annotations
+
+import natural_objects
+import numpy as np
+import pytest
+
+from flexdt.twin.calibration.without_phantom.hidden_gap import CHANCE, hidden_gap
+
+FRAMES, ROWS, COLUMNS = 90, 16, 72
+
+
+def streaks(
+    rng: np.random.Generator, half_width: float, first: int, gap: float
+) -> list[np.ndarray]:
+    """Frames of bodies that pass all columns, from column `first` on sampled `gap` further on."""
+    at = np.arange(COLUMNS) + gap * (np.arange(COLUMNS) >= first)
+    out = []
+    start = rng.uniform(0, 3 * COLUMNS, (ROWS, 9, 1))
+    speed = rng.uniform(1, 3, (ROWS, 9, 1)) * rng.choice([-1, 1], (ROWS, 9, 1))
+    for frame in range(FRAMES):
+        middle = (start + speed * frame) % (3 * COLUMNS) - COLUMNS
+        edge = (np.abs(at - middle) - 3.0) / half_width
+        image = (1.0 / (1.0 + np.exp(np.clip(edge, -40, 40)))).sum(axis=1)
+        out.append(image + rng.normal(0, 0.02, (ROWS, COLUMNS)))
+    return out
+
+
+def test_sharp_edges_tell_a_gap_or_exclude_it() -> None:
+    rng = np.random.default_rng(8)
+    for _ in range(2):
+        first, gap = int(rng.integers(31, 42)), float(rng.uniform(0.8, 2))
+        axis = first - 0.5 + rng.uniform(-4, 4)
+        found = hidden_gap(streaks(rng, 0.3, first, gap), axis, None, 1.5)
+        assert found is not None
+        assert found.likely is not None
+        assert found.likely.column == first
+        assert abs(found.likely.width - gap) < 3 * found.likely.sigma
+        without = hidden_gap(streaks(rng, 0.3, 0, 0.0), axis, None, 1.5)
+        assert without is not None
+        assert without.likely is None
+        assert without.column_px < 0.1
+
+
+def test_images_without_edges_leave_the_gap_in_the_sigma() -> None:
+    rng = np.random.default_rng(9)
+    noise = [rng.normal(0, 0.02, (ROWS, COLUMNS)) for _ in range(FRAMES)]
+    found = hidden_gap(noise, 36.0, None, 1.5)
+    assert found is not None
+    assert found.likely is None
+    assert 0.2 * CHANCE < found.chance < 2 * CHANCE
+    assert found.column_px > 0.05
+
+
+@pytest.mark.slow
+@pytest.mark.campaign(2)
+@pytest.mark.parametrize("kind", ["bone", "bottle", "foam", "printed"])
+def test_gaps_beside_the_axis_are_named_or_in_the_sigma(kind: str) -> None:
+    told = natural_objects.tried(kind, 601, gap=False, near=True)
+    assert abs(told.get("pull", 0.0)) < natural_objects.SIGMAS, told

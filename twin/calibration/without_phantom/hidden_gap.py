@@ -1,0 +1,243 @@
+"""A gap between two tiles that the scan may have without both ends of rays telling it.
+
+Within some columns of the axis, and where nothing that turns is seen nearer to the axis, a gap
+moves both ends of all rays alike: it looks like another axis, half of its width aside. Only what
+single frames show across the border itself tells it. The same edges pass all borders there, a few
+frames later, so the other borders say what the evidence of a border is without a gap, by how much
+it scatters, and how much a gap would stand out. A gap that would stand out and does not is
+excluded; of what is not, the width stays in the column's sigma.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import log_softmax, logsumexp, softmax
+
+from flexdt.twin.calibration.without_phantom.conjugate_rays import Profile
+from flexdt.twin.calibration.without_phantom.tile_gap import (
+    SIDE,
+    Gap,
+    likelihood,
+    local_sigma,
+    squares_by_distance,
+)
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+
+CHANCE: Final = 0.1
+"""Probability that a panel has a gap at one of the columns where it is hidden; assumed."""
+TOLD_ODDS: Final = 100.0
+"""Odds of a gap from which it is told."""
+WIDTHS_PX: Final = np.arange(0.25, 3.01, 0.25)
+"""Widths of gaps that are tried [px]."""
+WIDTH_SPREAD_PX: Final = 1.0
+"""Standard deviation of the widths of gaps before the images [px]; assumed."""
+BLURS_PX: Final = (0.0, 1.0)
+"""Standard deviations over which a gap is smeared that are tried [px]."""
+SHARES: Final = np.array([0.3, 0.65, 1.0])
+"""Of the evidence that the model expects of a gap: what blurred edges may leave."""
+FREEDOM: Final = 8.0
+"""Degrees of freedom of the scatter of evidence (Student): a third of the fewest borders."""
+LEAST_COLUMNS: Final = 14
+"""Columns on each side of the axis whose borders are compared, at least."""
+EDGES: Final = 0.2
+"""Part of all places there that is compared, those with most change."""
+MOST_EDGES: Final = 30_000
+"""Places that are compared, at most."""
+LEAST_PX: Final = 0.3
+"""Where both ends of rays tell steps to a third of this, nothing is hidden [px]."""
+SIGMAS: Final = 3.0
+"""Standard deviations of a step that are told."""
+
+
+_LOG_PRIOR: Final = log_softmax(-0.5 * np.square(WIDTHS_PX / WIDTH_SPREAD_PX))[:, None]
+"""Logarithm of the probabilities of the widths of gaps before the images, (w, 1)."""
+
+
+class HiddenGap(NamedTuple):
+    """What the scan leaves open about a gap beside its axis.
+
+    Attributes:
+        first, last: columns at which it may begin.
+        chance: probability that there is one.
+        width_px: root mean square of its width, no gap included [px].
+        likely: the gap, where its odds exceed TOLD_ODDS.
+    """
+
+    first: int
+    last: int
+    chance: float
+    width_px: float
+    likely: Gap | None
+
+    @property
+    def column_px(self) -> float:
+        """Standard deviation that it adds to the axis column [px]."""
+        return self.width_px / 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Evidence of gaps at columns.
+
+    Attributes:
+        found: logarithm of the likelihood of a gap over none by width and column, (w, c).
+        width: logarithm of the likelihood of the widths of a gap that is there, (w, c).
+    """
+
+    found: FloatArray
+    width: FloatArray
+
+    def beside(self, more: FloatArray) -> Evidence:
+        """Add log likelihoods (w, c) of other data, which do not tell widths."""
+        return Evidence(self.found + more, self.width)
+
+    @property
+    def ratio(self) -> FloatArray:
+        """Give the likelihood of a gap over none at each column, whatever its width, (c,)."""
+        return np.asarray(np.exp(np.minimum(logsumexp(self.found + _LOG_PRIOR, axis=0), 600.0)))
+
+    @property
+    def widths(self) -> FloatArray:
+        """Give the probabilities of the widths of a gap at each column, (w, c)."""
+        return np.asarray(softmax(self.width + _LOG_PRIOR, axis=0))
+
+
+def hidden_gap(
+    frames: Sequence[Float32Array], axis: float, profile: Profile | None, smoothing: float
+) -> HiddenGap | None:
+    """Judge the gaps that both ends of rays do not tell; None: the images have too few columns.
+
+    Args:
+        frames: line integrals of `tile_gap.averaged_rows`, some of a turn.
+        axis: column of the axis, to a pixel or two.
+        profile: distances between both ends of rays; None: too little turns.
+        smoothing: sigma of the columns' smoothing in the profile [px].
+    """
+    reach = _hidden_radius(profile, smoothing) if profile else math.inf
+    stack = np.asarray(frames, dtype=np.float64)
+    half = max(float(LEAST_COLUMNS), reach) + SIDE
+    low = math.floor(max(axis - half, 0.0))
+    end = math.ceil(min(axis + half, stack.shape[2]))
+    if end - low < 2 * SIDE + LEAST_COLUMNS:
+        return None
+    columns = np.arange(low + SIDE, end - SIDE + 1)
+    evidence = _evidence(stack[:, :, low:end])
+    if profile is not None:
+        evidence = evidence.beside(_evidence_of_rays(columns, axis, profile))
+    hidden = np.abs(columns - 0.5 - axis) <= reach
+    odds = CHANCE / (1.0 - CHANCE) * evidence.ratio * hidden / hidden.sum()
+    total = float(odds.sum())
+    wide = np.square(WIDTHS_PX) + np.square(local_sigma(WIDTHS_PX))
+    # Blurred and noisy edges tell that there is a gap better than how wide it is.
+    doubted = 0.5 * (evidence.widths + np.exp(_LOG_PRIOR))
+    mean_square = float(odds @ (wide @ doubted)) / (1.0 + total)
+    shown = columns[hidden]
+    best = int(odds.argmax())
+    return HiddenGap(
+        int(shown[0]), int(shown[-1]), total / (1.0 + total), math.sqrt(mean_square),
+        _gap_at(int(columns[best]), evidence.widths[:, best]) if total > TOLD_ODDS else None,
+    )  # fmt: skip
+
+
+def _gap_at(column: int, share: FloatArray) -> Gap:
+    """Give the gap at a column from the probabilities of its widths (w,)."""
+    width = float(share @ WIDTHS_PX)
+    spread = math.sqrt(float(share @ np.square(WIDTHS_PX - width)))
+    return Gap(column, width, max(spread, float(local_sigma(width))))
+
+
+def _hidden_radius(profile: Profile, smoothing: float) -> float:
+    """Give the distance from the axis up to which both ends of rays do not tell steps [px]."""
+    told = np.array([SIGMAS * profile.at(r).sigma < LEAST_PX for r in profile.radii.tolist()])
+    inner = 2.0 * smoothing
+    if not told.any():
+        return max(inner, float(profile.radii[-1]))
+    return max(inner, float(profile.radii[int(told.argmax())]))
+
+
+def _evidence_of_rays(columns: npt.NDArray[np.intp], axis: float, profile: Profile) -> FloatArray:
+    """Give log likelihoods over none, (w, c), by the steps that both ends of rays show."""
+    beside = columns - 0.5 - axis
+    steps = [profile.beside_axis(abs(b)) for b in beside.tolist()]
+    width = np.array([step.width for step in steps]) * np.sign(beside)
+    sigma = np.array([step.sigma for step in steps])
+    left = (width - WIDTHS_PX[:, None]) / sigma
+    return _log_student(left) - _log_student(width / sigma)
+
+
+def _evidence(images: FloatArray) -> Evidence:
+    """Judge gaps by what frames show.
+
+    Args:
+        images: frames of columns about the axis, (n, rows, c + 2 SIDE - 1).
+    """
+    table = (images - images.mean(axis=0)).reshape(-1, images.shape[2])
+    around = np.lib.stride_tricks.sliding_window_view(np.diff(table, axis=1), 2 * SIDE - 1, axis=1)
+    power = np.square(around).sum(axis=2)
+    share = min(EDGES, MOST_EDGES / power.size)
+    row, border = np.nonzero(power > np.quantile(power, 1.0 - share))
+    places, of_frame = power.shape[1], row // images.shape[1]
+    shape = len(BLURS_PX), len(WIDTHS_PX), places
+    if not len(row):
+        return Evidence(np.zeros(shape[1:]), np.zeros(shape[1:]))
+    edges = around[row, border] / np.sqrt(power[row, border])[:, None]
+    of_distance = squares_by_distance(edges)
+    without = likelihood(edges, of_distance, 0.0)
+    judged = []
+    for blur in BLURS_PX:
+        for width in WIDTHS_PX.tolist():
+            gain = likelihood(edges, of_distance, width, blur) - without
+            of_place = np.bincount(of_frame * places + border, gain, len(images) * places)
+            judged.append(_beside_others(np.asarray(of_place.reshape(-1, places), np.float64)))
+    found = np.array([one.found for one in judged]).reshape(shape)
+    gain = np.array([one.gain for one in judged]).reshape(shape)
+    trust = np.array([one.trust for one in judged]).reshape(shape[:2]).min(axis=1)
+    return Evidence(
+        np.logaddexp.reduce(found, axis=0) - math.log(len(BLURS_PX)),
+        np.logaddexp.reduce(gain * trust[:, None, None], axis=0),
+    )
+
+
+class Judged(NamedTuple):
+    """What frames show of gaps of one width.
+
+    Attributes:
+        found: logarithm of the likelihood of a gap over none beside other borders, (c,).
+        gain: the same by the model of the differences alone, (c,).
+        trust: part of that which its scatter justifies.
+    """
+
+    found: FloatArray
+    gain: FloatArray
+    trust: float
+
+
+def _beside_others(gains: FloatArray) -> Judged:
+    """Judge a gap at each border beside what other borders show.
+
+    Args:
+        gains: in log likelihood of a gap over none, by frame and border, (n, c).
+    """
+    whole = gains.sum(axis=0)
+    usual = float(np.median(whole))
+    between = 1.4826 * float(np.median(np.abs(whole - usual)))
+    of_frames = float(np.median(np.sqrt(np.square(gains).sum(axis=0))))
+    spread = max(between, of_frames, 1e-6)
+    excess = (whole - usual) / spread
+    # Where the model fits, a gap gains what it loses elsewhere, and its variance is twice its mean.
+    lost = max(-2.0 * usual, 0.0)
+    short = np.minimum(excess - SHARES[:, None] * lost / spread, 0.0)
+    found = np.logaddexp.reduce(_log_student(short), axis=0) - math.log(len(SHARES))
+    found = found - _log_student(np.maximum(excess, 0.0))
+    return Judged(np.asarray(found), whole, min(lost / spread**2, 1.0))
+
+
+def _log_student(deviation: FloatArray) -> FloatArray:
+    """Give the logarithm of Student's density but for a constant."""
+    return np.asarray(-(FREEDOM + 1.0) / 2.0 * np.log1p(np.square(deviation) / FREEDOM))
