@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from scipy.special import chdtrc, chdtri
+from scipy.special import chdtri, fdtrc, stdtr
 
 from flexdt.twin.calibration.diagnose import Finding, error, warning
 from flexdt.twin.calibration.fit.certificate import widened
@@ -60,10 +60,10 @@ def held_distance(free: FitResult, held: Mapping[str, float]) -> dict[str, float
     at = [names.index(n) for n in some]
     off = np.array([free.values[n] - held[n] for n in some])
     square = float(off @ np.linalg.solve(free.covariance[np.ix_(at, at)], off))
-    together = _deviate(float(chdtrc(len(some), max(square, 0.0))))
-    return {n: abs(o) / free.sigmas[n] for n, o in zip(some, off.tolist(), strict=True)} | {
-        "": together
-    }
+    freedom = free.certificate.dof
+    alone = [abs(o) / free.sigmas[n] for n, o in zip(some, off.tolist(), strict=True)]
+    scores = {n: _deviate_of(ratio, freedom) for n, ratio in zip(some, alone, strict=True)}
+    return scores | {"": _deviate(_chance(square, len(some), freedom))}
 
 
 def judge_held(free: FitResult, held: Mapping[str, float]) -> Finding | None:
@@ -163,7 +163,7 @@ def judge_priors(loose: FitResult, exact: Container[str] = ()) -> PriorsJudged:
     """
     c = loose.certificate
     known = [(i, n, e) for i, (n, e) in enumerate(c.estimates.items()) if e.prior is not None]
-    if not loose.identifiable or not known:
+    if not loose.identifiable or not known or not np.isfinite(c.covariance).all():
         return PriorsJudged(None, 1.0)
     at, names, found = map(list, zip(*known, strict=True))
     width = np.array([e.prior for e in found])
@@ -179,9 +179,10 @@ def judge_priors(loose: FitResult, exact: Container[str] = ()) -> PriorsJudged:
     spread = kept * (kept / LOOSE**2 + values[some])
     square = float(np.sum((vectors.T @ moved)[some] ** 2 / spread))
     count = int(some.sum())
-    chance = float(chdtrc(count, square))
+    chance = _chance(square, count, c.dof)
     sigmas = np.array([e.sigma for e in found])
-    scores = np.abs(moved) / np.sqrt(1.0 / LOOSE**2 + sigmas**2 / width**2)
+    ratios = np.abs(moved) / np.sqrt(1.0 / LOOSE**2 + sigmas**2 / width**2)
+    scores = np.array([_deviate_of(ratio, c.dof) for ratio in ratios.tolist()])
     # The images alone, as a quadratic of curvature A and gradient y, and what they and all priors
     # but one would say of that one.
     weight = np.where(some, 1.0 / values - 1.0, 0.0)
@@ -265,5 +266,26 @@ def narrow_priors(judged: PriorsJudged) -> Finding:
 
 
 def _deviate(chance: float) -> float:
-    """The normal deviate that is as improbable."""
+    """Give the normal deviate that is as improbable."""
     return float(np.sqrt(chdtri(1, max(chance, 1e-300))))
+
+
+def _deviate_of(ratio: float, freedom: float) -> float:
+    """Give the normal deviate that is as improbable as a deviation in sigmas.
+
+    Args:
+        ratio: the deviation over its sigma.
+        freedom: degrees of freedom with which sigma is known (Student).
+    """
+    return _deviate(2.0 * float(stdtr(freedom, -abs(ratio))))
+
+
+def _chance(square: float, count: int, freedom: float) -> float:
+    """Give the probability of a larger sum of squares in sigmas.
+
+    Args:
+        square: the sum.
+        count: of the squares.
+        freedom: degrees of freedom with which the sigmas are known (Fisher).
+    """
+    return float(fdtrc(count, freedom, max(square, 0.0) / count))

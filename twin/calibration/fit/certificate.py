@@ -44,6 +44,10 @@ RANK_TOLERANCE = 1e-8
 """Singular values of the column-scaled Jacobian below this share of the largest are zero."""
 ROUNDING = 1e-9
 """Residuals of exact positions [whitened]; what they follow is rounding."""
+LEAST_FREEDOM = 1e-3
+"""Degrees of freedom from which the residuals have a spread."""
+ROUNDING_OF_COLUMNS = 1e-13
+"""Of the scaled normal equations: a direction that says less is not determined at all."""
 SOURCES = {
     "bead": "beads",
     "strain": "the phantom's scale",
@@ -458,14 +462,49 @@ def _of_what_was_asked(given: Conditioning, whole: Conditioning) -> Conditioning
 
 def spread_of_residuals(
     problem: FitProblem, x: FloatArray, use: npt.NDArray[np.bool_], prior_noise: float
-) -> tuple[float, int]:
-    """Standard deviation of the whitened residuals at `x`, priors included, and its degrees of
-    freedom; nan if there are none. Arguments as `certify`."""
+) -> tuple[float, float]:
+    """Give the standard deviation of the whitened residuals at `x`, and its degrees of freedom.
+
+    A column costs the part of a degree of freedom that the images, not its prior, determine
+    (MacKay, Neural Computation 4 (1992) 415): a wide prior costs a whole one. Where priors are
+    moved by more than that to fit the images, what they are moved by counts as residuals.
+
+    Args:
+        problem: the data.
+        x: column values, internal units.
+        use: (n, k) positions that counted.
+        prior_noise: spread of the whitened residuals with which the priors were weighed.
+
+    Returns:
+        The standard deviation, nan if there are no degrees of freedom, and how many there are.
+    """
+    _, _, norms, _, upper, _ = problem.evaluate(x, use, 1)
+    told = upper + np.triu(upper, 1).T
     weight = problem.prior_weight(prior_noise)
-    dof = max(2 * int(use.sum()) + int((weight > 0).sum()) - len(x), 0)
-    chi2 = float(np.sum(problem.residuals(x, use)[1][use] ** 2))
-    chi2 += float(np.sum(weight * (x - problem.prior_mean) ** 2))
-    return (math.sqrt(chi2 / dof) if dof else math.nan), dof
+    count = 2.0 * int(use.sum())
+    dof = count - _determined(told, weight)
+    if not dof > LEAST_FREEDOM:
+        return math.nan, 0.0
+    square = float(np.sum(norms[use] ** 2))
+    moved = float(np.sum(weight * (x - problem.prior_mean) ** 2))
+    with_priors = max(count - float((weight == 0.0).sum()), LEAST_FREEDOM)
+    return math.sqrt(max(square / dof, (square + moved) / with_priors)), dof
+
+
+def _determined(told: FloatArray, weight: FloatArray) -> float:
+    """Give how many columns the images determine.
+
+    Args:
+        told: (c, c) normal equations of the images.
+        weight: (c,) of the priors.
+    """
+    whole = told + np.diag(weight)
+    diagonal = np.diag(whole)
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    values, vectors = np.linalg.eigh(whole * np.outer(scale, scale))
+    some = values > ROUNDING_OF_COLUMNS
+    prior_share = np.einsum("ij,i->j", vectors[:, some] ** 2, weight * scale**2) / values[some]
+    return float(some.sum() - prior_share.sum())
 
 
 def _shares(names: Sequence[str], pull: FloatArray, sigma: float) -> dict[str, float]:
