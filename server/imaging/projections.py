@@ -263,8 +263,8 @@ class Imaging:
             return apart.found, out, cone.rows
 
     async def ray(self, sample: Sample, cone: ConeVec) -> dict[str, float]:
-        """Compute material -> path [mm] to the one pixel of `cone`, n = 1, in the object's
-        frame."""
+        """Compute material -> path [mm] to the one pixel of `cone`, n = 1, in
+        the object's frame."""
         found, paths = await self.nominal_paths(sample, cone.with_shape((1, 1)))
         lengths = paths.sum(axis=(1, 2, 3)).tolist()
         return {part.material.name: x for part, x in zip(found, lengths, strict=True)}
@@ -279,7 +279,8 @@ class Imaging:
             cone: n views with the detector's shape, in the object's frame.
 
         Returns:
-            The materials (m), and float32 (m, n, rows, cols) [mm]; none for an empty stage.
+            The materials (m), and float32 (m, n, rows, cols) [mm]; none for an empty
+            stage.
 
         Raises:
             ProjectorUnavailable: the projector does not answer.

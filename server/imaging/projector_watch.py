@@ -1,7 +1,8 @@
 """Says why no image can be computed now, while somebody looks: no projector answers.
 
-Each projector is asked for its health again and again; one that computes answers as well. A refused
-or lost connection is known at once; a process that says nothing for `SILENT_S` does not answer.
+Each projector is asked for its health again and again; one that computes answers as well.
+A refused or lost connection is known at once; a process that says nothing for `SILENT_S`
+does not answer.
 """
 
 from __future__ import annotations
@@ -42,7 +43,8 @@ class ProjectorWatch:
         changed: called whenever `problem` has changed.
         every_s: between an answer and the next question [s].
         silent_s: after which a projector that is asked does not answer [s].
-        problem: why none answers, of the first one; None where any answers, or none was asked.
+        problem: why none answers, of the first one; None where any answers, or none was
+            asked.
     """
 
     clients: Sequence[Watched]

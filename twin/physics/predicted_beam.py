@@ -86,8 +86,8 @@ class PredictedExposure:
 
     Attributes:
         kV, power_W, exposure_ms: the setting, of one read-out.
-        open_beam_fill: counts of the open beam over the panel's range, saturated from 1; None where
-            the physics has no spectrum for the voltage.
+        open_beam_fill: counts of the open beam over the panel's range, saturated from 1;
+            None where the physics has no spectrum for the voltage.
         shares: of the pixels behind the sample; None where that is not known.
         doubts: what the prediction says against the setting, with what would do.
     """
@@ -114,7 +114,8 @@ def counts_behind(
         chain: tube, materials, panel.
         camera: its mode decides the electrons in a count.
         exposure: tube and time; X-rays are on.
-        paths_mm: path through each of the chain's substances, float32 (m, rows, cols) [mm].
+        paths_mm: path through each of the chain's substances, float32 (m, rows, cols)
+            [mm].
         view: cone_vec row (12,) of these pixels.
         pixels_a_side: of the camera, that each of these pixels stands for.
 

@@ -1,7 +1,8 @@
 """Warn of projections of a plan whose pixels the sample starves, or nothing shades enough.
 
-What the rays meet is not known here: `sample_probes` says which rays are looked at, whoever has the
-sample projects it along them, and `predicted_exposures` judges the counts.
+What the rays meet is not known here: `sample_probes` says which rays are looked at,
+whoever has the sample projects it along them, and `predicted_exposures` judges the
+counts.
 """
 
 from __future__ import annotations
@@ -47,7 +48,8 @@ class SampleProbe:
     Attributes:
         line: of the script, that first uses the setting.
         exposure, camera: the setting, of one read-out.
-        cone_vec: views of `PROBE_RAYS` a side, with the shape (rows, cols) of the grid of rays.
+        cone_vec: views of `PROBE_RAYS` a side, with the shape (rows, cols) of the grid of
+            rays.
         pixels_a_side: of the camera, that each ray stands for.
         indices: of all images of the setting.
     """
@@ -87,7 +89,8 @@ def shares_behind(
     Args:
         chain: tube, materials of the sample, panel.
         probe: the views.
-        paths_mm: path through each material along its rays, float32 (m, n, rows, cols) [mm].
+        paths_mm: path through each material along its rays, float32 (m, n, rows, cols)
+            [mm].
         rows: cone_vec of the views, (n, 12).
     """
     counts = [
