@@ -1,8 +1,7 @@
-"""Says why no image can be computed now, while somebody looks: no projector answers.
+"""Reports that no projector answers, so that no image can be computed now.
 
-Each projector is asked for its health again and again; one that computes answers as well.
-A refused or lost connection is known at once; a process that says nothing for `SILENT_S`
-does not answer.
+Each projector is asked for its health repeatedly; one that computes answers as well. A
+refused or lost connection is reported at once, a silent process after `SILENT_S`.
 """
 
 from __future__ import annotations
@@ -16,7 +15,9 @@ from flexdt.protocol import RpcError
 from flexdt.runtime.wire_errors import ProjectorUnavailable
 
 ASK_EVERY_S: Final = 0.4
+"""Time between an answer and the next question [s]."""
 SILENT_S: Final = 1.2
+"""Time after which a projector without an answer is reported [s]."""
 
 
 class Watched(Protocol):
@@ -62,13 +63,14 @@ class ProjectorWatch:
                 group.create_task(self._watch(client))
 
     async def _watch(self, client: Watched) -> None:
+        """Ask one projector repeatedly, while somebody wants to know."""
         while True:
             if self.asks():
                 await self._look(client)
             await asyncio.sleep(self.every_s)
 
     async def _look(self, client: Watched) -> None:
-        """Ask once, and wait for the answer however late; say so where it is late."""
+        """Ask once and wait for the answer; report a late one."""
         asked = asyncio.ensure_future(client.health())
         try:
             if not (await asyncio.wait([asked], timeout=self.silent_s))[0]:
@@ -84,6 +86,7 @@ class ProjectorWatch:
             asked.cancel()
 
     def _found(self, client: Watched, problem: str | None) -> None:
+        """Record the problem of one projector; call `changed` if the overall one changes."""
         self._problems[client] = problem
         known = [self._problems.get(each) for each in self.clients]
         now = None if None in known else known[0]

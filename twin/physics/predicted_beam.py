@@ -82,14 +82,14 @@ class CountShares:
 
 @dataclass(frozen=True)
 class PredictedExposure:
-    """What a setting of tube and camera was predicted to give before its images were made.
+    """The predicted exposure of a setting of tube and camera, before its images are made.
 
     Attributes:
         kV, power_W, exposure_ms: the setting, of one read-out.
         open_beam_fill: counts of the open beam over the panel's range, saturated from 1;
             None where the physics has no spectrum for the voltage.
         shares: of the pixels behind the sample; None where that is not known.
-        doubts: what the prediction says against the setting, with what would do.
+        doubts: objections to the setting, each with a setting that would do.
     """
 
     kV: float
@@ -117,7 +117,7 @@ def counts_behind(
         paths_mm: path through each of the chain's substances, float32 (m, rows, cols)
             [mm].
         view: cone_vec row (12,) of these pixels.
-        pixels_a_side: of the camera, that each of these pixels stands for.
+        pixels_a_side: of the camera, along each side of one of these pixels.
 
     Returns:
         Of one pixel of the camera in the place of each of these, float32 (rows, cols).

@@ -1,8 +1,7 @@
 """Warn of projections of a plan whose pixels the sample starves, or nothing shades enough.
 
-What the rays meet is not known here: `sample_probes` says which rays are looked at,
-whoever has the sample projects it along them, and `predicted_exposures` judges the
-counts.
+The plan has no sample: `sample_probes` chooses the rays, the caller projects the sample
+along them, and `predicted_exposures` judges the counts.
 """
 
 from __future__ import annotations
@@ -32,11 +31,11 @@ from flexdt.twin.script.planning.plan import ScanPlan
 from flexdt.twin.script.problems import ScriptProblem
 
 PROBE_VIEWS: Final = 3
-"""Views of each setting that are looked at."""
+"""Number of views of each setting that are examined."""
 PROBE_SETTINGS: Final = 4
-"""Settings of tube and camera that are looked at, the first ones."""
+"""Number of settings of tube and camera that are examined, the first ones."""
 PROBE_RAYS: Final = 128
-"""Rays along the longer side of a panel, at least, where it has so many pixels."""
+"""Least number of rays along the longer side of a panel, if it has so many pixels."""
 SHARE_NAMES: Final = ("saturated", "starved")
 """Members of `CountShares`; warnings have codes such as `starved_pixels`."""
 
@@ -50,7 +49,7 @@ class SampleProbe:
         exposure, camera: the setting, of one read-out.
         cone_vec: views of `PROBE_RAYS` a side, with the shape (rows, cols) of the grid of
             rays.
-        pixels_a_side: of the camera, that each ray stands for.
+        pixels_a_side: of the camera, for each ray.
         indices: of all images of the setting.
     """
 
@@ -63,7 +62,7 @@ class SampleProbe:
 
 
 def sample_probes(plan: ScanPlan) -> tuple[SampleProbe, ...]:
-    """Choose the rays that tell how the projections of a plan are exposed.
+    """Choose rays from which the exposure of a plan's projections is predicted.
 
     Args:
         plan: with the saved images, their settings and positions.
@@ -162,7 +161,7 @@ def sample_problems(
 
 
 def _sentences(seen: CountShares | None) -> list[tuple[str, str]]:
-    """Say which parts of the pixels are worth a warning: (name, sentence) each."""
+    """List the shares of pixels that need a warning: (name, sentence) each."""
     if seen is None:
         return []
     shares = [(name, getattr(seen, name)) for name in SHARE_NAMES]
