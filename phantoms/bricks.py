@@ -157,7 +157,14 @@ class Brickwork:
         self, beads: FloatArray, radius_mm: float, metal: Material, turn_deg: float = 0.0
     ) -> analytic.Scene:
         """Make the scene of the bricks, each turned by `turn_deg` against the one below,
-        and beads (k, 3) [mm]."""
+        and beads (k, 3) [mm].
+
+        Args:
+            beads: centres (k, 3) [mm].
+            radius_mm: of the beads.
+            metal: of the beads.
+            turn_deg: about z, from brick to brick.
+        """
         plastic = material(lego_data()["assumed"]["material"])
         solids = [
             analytic.Solid(shape, plastic.name, sign * plastic.mu_per_mm)

@@ -62,7 +62,15 @@ class Channel:
 
 def channels(phantom: Phantom) -> tuple[Channel, ...]:
     """Divide a phantom into its materials and where they are; empty for a
-    phantom of nothing."""
+    phantom of nothing.
+
+    Args:
+        phantom: solids, surfaces and voxels.
+
+    Returns:
+        A channel for each material of solids, each surface and each label of voxels; a
+        material without composition is taken as water.
+    """
     amounts: dict[str, list[Solid]] = {}
     stand_ins: set[str] = set()
     names = dict.fromkeys(solid.material for solid in phantom.scene.solids)
@@ -122,7 +130,11 @@ def chain_through(
 
 def attenuating(phantom: Phantom) -> tuple[tuple[Body, float], ...]:
     """List bodies and factors: their projections times these add up to the
-    phantom's line integrals."""
+    phantom's line integrals.
+
+    Args:
+        phantom: solids, surfaces and voxels.
+    """
     out: list[tuple[Body, float]] = []
     if phantom.scene.solids:
         out.append((phantom.scene, 1.0))
@@ -195,7 +207,15 @@ def _find(name: str) -> Material | None:
 
 
 def _amounts(solid: Solid, known: dict[str, Material]) -> list[tuple[str, float]]:
-    """List (material, amount) that a solid adds, 1 for the material's own density."""
+    """List (material, amount) that a solid adds, 1 for the material's own density.
+
+    Args:
+        solid: with its attenuation.
+        known: material's name -> material with composition.
+
+    Returns:
+        One entry, or two where the solid replaces one material by another.
+    """
     own = known.get(solid.material)
     if own is None:
         return [(STAND_IN, solid.mu_per_mm / materials()[STAND_IN].mu_per_mm)]

@@ -164,10 +164,18 @@ Lengths = Annotated[analytic.Vector, BeforeValidator(partial(lengths, where=NAME
 
 
 def packed(dtype: str) -> PlainValidator:
-    """Make the validator of an array of `dtype` that `PACK` wrote; nothing is executed."""
+    """Make the validator of an array of `dtype` that `PACK` wrote; nothing is executed.
+
+    Args:
+        dtype: name of the array's type, such as float32.
+    """
 
     def read(value: object) -> npt.NDArray[np.generic]:
-        """Decode {dtype, shape, data}; check type, size and base64."""
+        """Decode {dtype, shape, data}; check type, size and base64.
+
+        Args:
+            value: the document of an array.
+        """
         if get(value, "dtype", NAMED_ALREADY) != dtype:
             raise wrong(get(value, "dtype", NAMED_ALREADY), "dtype", dtype)
         shape = each(get(value, "shape", NAMED_ALREADY), "shape", _count)
@@ -228,6 +236,9 @@ _READERS: Final[Mapping[str, Reader]] = {
 def scene_to_dict(scene: analytic.Scene) -> dict[str, object]:
     """Convert a scene to a JSON-able document: `{solids: [{shape: {kind,
     ...}, material, mu_per_mm}]}`.
+
+    Args:
+        scene: solids of any shape.
 
     Example:
         >>> from flexdt.phantoms import load_phantom

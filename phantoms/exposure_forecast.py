@@ -308,6 +308,14 @@ def _check_settings(
 ) -> None:
     """Check that the machine has these settings.
 
+    Args:
+        machine: with the ranges.
+        kVs: voltages.
+        power_W: of the tube.
+        exposure_ms: of one read-out.
+        averages: read-outs of an image.
+        images: of the scan.
+
     Raises:
         LimitError: names the setting, what was asked and what is allowed.
     """
@@ -406,7 +414,12 @@ class _SeenDetail:
 
     def setting(self, layer: str, at: ExposureSettings) -> Setting:
         """Compute contrast and dose of a setting; without contrast where a
-        pixel is saturated."""
+        pixel is saturated.
+
+        Args:
+            layer: name of the filter.
+            at: voltage, power and time.
+        """
         chain = self.layers.chains[layer]
         plain, changed = (
             pixel_reading(chain, self.camera, at, one.flux, one.paths_mm, one.added)
@@ -491,7 +504,13 @@ class _Ray:
         self, detail: tuple[Substance | None, float], substances: Sequence[Substance]
     ) -> _Ray:
         """Add so much of a substance to the ray, or remove it from the substance
-        that attenuates most."""
+        that attenuates most.
+
+        Args:
+            detail: substance and thickness [mm]; without a substance, a void of that
+                thickness.
+            substances: of the ray's paths.
+        """
         substance, thickness = detail
         if substance is not None:
             return replace(self, added=(substance, thickness))

@@ -56,6 +56,9 @@ class Material:
         """Interpolate the linear attenuation coefficient at `energy_keV` [1/mm], log-log
         between the points.
 
+        Args:
+            energy_keV: of the photons.
+
         Raises:
             LimitError: the energy is outside the table.
         """

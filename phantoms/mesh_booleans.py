@@ -55,6 +55,9 @@ def cut(
     Args:
         parts: solids, surfaces and the priority of both.
 
+    Returns:
+        The remaining parts of the solids, and of the surfaces.
+
     Raises:
         PhantomError: something round, a hole, or a mesh that meets itself would have to
             be cut.
@@ -111,7 +114,12 @@ def _filled(one: analytic.Solid | Surface) -> Surface:
 
 
 def _outside(surface: Surface, others: Sequence[Surface]) -> Surface | None:
-    """Subtract the others from a filled mesh; None if nothing is left."""
+    """Subtract the others from a filled mesh; None if nothing is left.
+
+    Args:
+        surface: filled.
+        others: filled, that are taken away.
+    """
     import manifold3d
 
     solids = [
@@ -154,6 +162,10 @@ def _boxes_meet(bodies: Sequence[npt.NDArray[np.float64]]) -> bool:
 
 def _solid(mesh: TriangleMesh, bodies: Sequence[npt.NDArray[np.int64]]) -> manifold3d.Manifold:
     """Unite the bodies, each without the cavities in it.
+
+    Args:
+        mesh: all bodies and cavities.
+        bodies: indices of the faces of each.
 
     Raises:
         PhantomError: the surface of one meets itself.

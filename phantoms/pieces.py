@@ -123,6 +123,9 @@ def size_about_origin(scene: analytic.Scene, surfaces: Sequence[Surface] = ()) -
 def bounds(shape: analytic.Shape) -> tuple[FloatArray, FloatArray]:
     """Compute the corners of the smallest axis-aligned box around the shape, (3,) each [mm].
 
+    Args:
+        shape: any shape of a solid.
+
     Raises:
         GeometryError: a shape that cannot be, such as an unbounded polyhedron.
     """

@@ -67,6 +67,9 @@ def shepp_logan(size_mm: float = 50.0) -> Phantom:
     """Make the phantom scaled so that its unit cube [-1, 1] measures `size_mm` [mm]
     along each side.
 
+    Args:
+        size_mm: of the cube.
+
     Example:
         >>> len(shepp_logan(50.0).scene.solids)
         10
@@ -122,6 +125,9 @@ def is_shipped(name: str) -> bool:
 @public
 def load_phantom(name: str) -> Phantom:
     """Make the phantom called `name`; a bare cuboid's name has five beads.
+
+    Args:
+        name: see `phantom_names`.
 
     Raises:
         UnknownNameError: lists the available names.
@@ -234,7 +240,13 @@ def _require_none(material: str | None, what: str) -> None:
 
 
 def _named(word: str, material: str | None, keep: bool) -> Phantom:
-    """Make the phantom of a path or a shipped name."""
+    """Make the phantom of a path or a shipped name.
+
+    Args:
+        word: path of a file, or name.
+        material: of a mesh.
+        keep: leave a mesh where it is instead of centring it.
+    """
     path = Path(word)
     kind = path.suffix.lower()
     if kind.lstrip(".") in FORMATS:
@@ -255,7 +267,13 @@ def _named(word: str, material: str | None, keep: bool) -> Phantom:
 def _array(
     values: np.ndarray[Any, Any], material: str | None, voxel_mm: float | Vector | None
 ) -> Phantom:
-    """Make the phantom of an array: attenuation, or the part that `material` fills."""
+    """Make the phantom of an array: attenuation, or the part that `material` fills.
+
+    Args:
+        values: (z, y, x).
+        material: of the filled part; None: the values are attenuation [1/mm].
+        voxel_mm: spacing, one number or (x, y, z).
+    """
     if voxel_mm is None:
         raise PhantomError(
             "an array needs voxel_mm, the edge of its voxels [mm]; or give a Volume",
@@ -280,7 +298,16 @@ def _array(
 
 
 def _labelled(sample: object, names: Mapping[int, str], voxel_mm: float | Vector | None) -> Phantom:
-    """Make voxels of several materials from an array of labels or a Volume that holds them."""
+    """Make voxels of several materials from an array of labels or a Volume that holds them.
+
+    Args:
+        sample: array of labels, or a Volume.
+        names: label -> material of every label except 0, which is nothing.
+        voxel_mm: spacing of an array; a Volume has its own.
+
+    Raises:
+        PhantomError: neither array nor Volume, or a label without a material.
+    """
     labels: Any = sample.data if isinstance(sample, Volume) else sample
     if not isinstance(labels, np.ndarray) or labels.dtype.kind not in "buif":
         raise PhantomError(

@@ -139,7 +139,11 @@ def _ball_around() -> float:
 
 
 def _mesh(shape: analytic.Shape) -> trimesh.Trimesh:
-    """Make the mesh of a shape [mm]."""
+    """Make the mesh of a shape [mm].
+
+    Args:
+        shape: of a solid.
+    """
     import trimesh
 
     mesh: trimesh.Trimesh

@@ -72,7 +72,15 @@ def _add_solid(
     data: npt.NDArray[np.float32], shape: Shape, mu: float, voxel_mm: float, oversample: int
 ) -> None:
     """Add a convex solid to `data` [z, y, x], with `oversample` columns per voxel
-    along x and y."""
+    along x and y.
+
+    Args:
+        data: attenuation [1/mm], changed.
+        shape: convex.
+        mu: attenuation of the solid [1/mm].
+        voxel_mm: spacing.
+        oversample: columns per voxel along each of x and y.
+    """
     from flexdt.phantoms import voxelise_kernels as kernels
 
     nz, ny, nx = data.shape
@@ -100,7 +108,14 @@ def _add_solid(
 def _add_surface(
     data: npt.NDArray[np.float32], surface: Surface, voxel_mm: float, oversample: int
 ) -> None:
-    """Add a filled mesh to `data` [z, y, x]; raise PhantomError if it is not closed."""
+    """Add a filled mesh to `data` [z, y, x]; raise PhantomError if it is not closed.
+
+    Args:
+        data: attenuation [1/mm], changed.
+        surface: closed.
+        voxel_mm: spacing.
+        oversample: columns per voxel along each of x and y.
+    """
     from flexdt.phantoms import voxelise_kernels as kernels
 
     nz, ny, nx = data.shape
@@ -150,7 +165,17 @@ def _columns(shape: Shape, x: FloatArray, y: FloatArray) -> _Interval:
 
 def _quadric(to_unit: FloatArray, center: FloatArray, x: FloatArray, y: FloatArray) -> _Interval:
     """Solve for the interval where |to_unit (p - center)| <= 1 along z; unbounded
-    in an upright cylinder."""
+    in an upright cylinder.
+
+    Args:
+        to_unit: (3, 3), maps the quadric to the unit sphere or cylinder.
+        center: (3,) [mm].
+        x: of the columns, broadcast with y [mm].
+        y: of the columns [mm].
+
+    Returns:
+        Lower and upper end [mm]; an empty interval ends before it begins.
+    """
     cx, cy, cz = center
     direction = to_unit[:, 2]
     a = float(direction @ direction)

@@ -15,7 +15,16 @@ from flexdt.twin.projection.kernels.compiling import linked, serial
 
 @linked
 def _add_interval(data, iy, ix, low, high, value):
-    """Add `value` times the covered fraction to the voxels of one column; heights in voxels."""
+    """Add `value` times the covered fraction to the voxels of one column; heights in voxels.
+
+    Args:
+        data: (z, y, x), changed.
+        iy: row of the column.
+        ix: column of the grid.
+        low: lower end [voxels].
+        high: upper end [voxels].
+        value: that is added to a covered voxel.
+    """
     nz = data.shape[0]
     low = max(low, 0.0)
     high = min(high, float(nz))

@@ -129,6 +129,9 @@ def parse_event(data: bytes | str) -> AcquilaEvent:
 
     Missing and null texts become "", numbers in arguments their text.
 
+    Args:
+        data: one JSON object, at most `MAX_BYTES`.
+
     Raises:
         AcquilaError: not a JSON object with a component and a command, or a field that is
             too long or has characters that no event can carry.

@@ -80,6 +80,12 @@ def json_pieces(document: object) -> list[bytes]:
     The encoder writes an unguessable mark in place of each large value; the marks are
     then replaced by the value's base64, so that the document is never copied as a whole.
 
+    Args:
+        document: plain data, with bytes where the wire has binary values.
+
+    Returns:
+        The document's parts in order, as bytes.
+
     Raises:
         ValueError, TypeError: as there.
     """
@@ -108,6 +114,12 @@ def json_pieces(document: object) -> list[bytes]:
 
 def read_msgpack(data: bytes | bytearray | memoryview) -> object:
     """Parse one MessagePack object, with strings as UTF-8 and binary values as bytes.
+
+    Args:
+        data: the object, with nothing after it.
+
+    Returns:
+        Plain data: dict, list, str, bytes, numbers, None.
 
     Raises:
         ValueError: names the problem.
@@ -150,7 +162,11 @@ def write_msgpack(document: object) -> bytes:
 
 
 def _check_depth(document: object) -> None:
-    """Raise ValueError for nesting deeper than `MAX_DEPTH`, or for a timestamp."""
+    """Raise ValueError for nesting deeper than `MAX_DEPTH`, or for a timestamp.
+
+    Args:
+        document: plain data that a codec has read.
+    """
     level: list[object] = [document]
     for _ in range(MAX_DEPTH + 1):
         inner: list[object] = []

@@ -177,7 +177,11 @@ class Connection:
             self._begun += data[last:]
 
     def _feed_each_line(self, data: bytes) -> None:
-        """Divide JSON lines one by one; reject HTTP and lines that are too long."""
+        """Divide JSON lines one by one; reject HTTP and lines that are too long.
+
+        Args:
+            data: received bytes, any part of the stream.
+        """
         *ends, rest = data.split(b"\n")
         for end in ends:
             line = bytes(self._begun) + end
@@ -201,7 +205,11 @@ class Connection:
             self._refuse(too_large("a line", f"at least {came}", self.max_message))
 
     def _feed_frames(self, data: bytes | bytearray | memoryview) -> None:
-        """Divide MessagePack frames; skip the rest of one that is too long."""
+        """Divide MessagePack frames; skip the rest of one that is too long.
+
+        Args:
+            data: received bytes, any part of the stream.
+        """
         skipped = min(self._skip, len(data))
         self._skip -= skipped
         begun = self._begun
@@ -426,6 +434,9 @@ def frame_head(size: int) -> bytes:
 def pack(message: Message) -> tuple[bytes, memoryview | None]:
     """Encode a frame as its length and head, and the payload that follows (or None).
 
+    Args:
+        message: what the frame carries.
+
     Raises:
         RpcError: -32008, a frame of 16 MiB or more.
         ValueError, TypeError, OverflowError: something that MessagePack cannot hold.
@@ -472,6 +483,13 @@ def _split(body: memoryview) -> object | None:
     to the end of the frame. The same bytes may occur inside another value, so each
     candidate is decoded without its payload first; the number of attempts is bounded,
     which limits the work that a hostile frame can cause.
+
+    Args:
+        body: a frame without its length.
+
+    Returns:
+        The document; None where `data` is not at the end, or the frame is not
+        MessagePack.
     """
     attempts = 0
     for window in _HEAD_WINDOWS_BYTES:

@@ -129,7 +129,11 @@ def event(topic: str, seq: int, time: float, data: object) -> Notification:
 
 
 def to_plain(message: Message) -> object:
-    """Convert a message to the dict (or the list, for a batch) that a codec encodes."""
+    """Convert a message to the dict (or the list, for a batch) that a codec encodes.
+
+    Args:
+        message: a call, an answer, a malformed message (its error) or a batch.
+    """
     match message:
         case Request(id, method, params):
             return _call({"jsonrpc": "2.0", "id": id, "method": method}, params)
@@ -182,7 +186,11 @@ def _call(plain: dict[str, object], params: Params) -> dict[str, object]:
 
 
 def _single(document: object) -> Single:
-    """Convert one document; anything wrong becomes `Malformed` with its id."""
+    """Convert one document; anything wrong becomes `Malformed` with its id.
+
+    Args:
+        document: plain data; not a batch.
+    """
     if not isinstance(document, dict):
         return Malformed(invalid_request(f"expected an object, got {_kind(document)}"))
     id = document.get("id")
@@ -202,7 +210,15 @@ def _single(document: object) -> Single:
 
 
 def _request(document: dict[object, object], id: Id) -> Single:
-    """Read a request, or a notification if the document has no id."""
+    """Read a request, or a notification if the document has no id.
+
+    Args:
+        document: with the member `method`.
+        id: its valid id, or None.
+
+    Returns:
+        The call, or `Malformed` with the first problem.
+    """
     method = document["method"]
     params = document.get("params")
     extra = [clip(k, 40) for k in document if k not in ("jsonrpc", "id", "method", "params")]
@@ -386,6 +402,9 @@ class Correlation(Generic[_W]):
 
         Answers to abandoned requests are dropped. A malformed message with an id counts
         as the answer to that request; on a server the caller must answer it with `reply`.
+
+        Args:
+            message: what the peer sent.
 
         Returns:
             Calls, and answers with their waiters.

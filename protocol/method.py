@@ -117,7 +117,13 @@ def parse_result(model: type[_M], given: object) -> _M:
 
 
 def _explain(method: str, error: ValidationError, allowed: list[str]) -> RpcError:
-    """Convert a validation error to -32602; list at most 50 problems with path and value."""
+    """Convert a validation error to -32602; list at most 50 problems with path and value.
+
+    Args:
+        method: its name on the wire.
+        error: of the check of its parameters.
+        allowed: names of the method's parameters.
+    """
     problems: list[dict[str, object]] = []
     for e in error.errors()[:50]:
         problem: dict[str, object] = {

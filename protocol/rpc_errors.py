@@ -161,7 +161,12 @@ def clip(value: object, limit: int = 200) -> str:
 
 
 def _brief(value: object, limit: int) -> str:
-    """Format like `repr`, but skip the parts that would be cut off."""
+    """Format like `repr`, but skip the parts that would be cut off.
+
+    Args:
+        value: plain data, of any size.
+        limit: number of characters that are needed.
+    """
     some = limit // 2
     match value:
         case str() | bytes() | bytearray():

@@ -217,7 +217,11 @@ def _application(pages: Pages, token: str | None, *, loopback: bool) -> Callable
     loop = asyncio.get_running_loop()
 
     def response(asked: Mapping[str, Any]) -> HttpResponse:
-        """Check a request and have the loop make its page."""
+        """Check a request and have the loop make its page.
+
+        Args:
+            asked: the request as WSGI has it.
+        """
         path = asked["PATH_INFO"]
         given = asked.get("HTTP_AUTHORIZATION", "")
         if loopback and "HTTP_HOST" in asked and _foreign(asked["HTTP_HOST"]):

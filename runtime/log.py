@@ -160,7 +160,15 @@ class Sparing:
         error: bool = False,
         **facts: object,
     ) -> None:
-        """Write a line like `log`, or count it; its kind is the event unless given."""
+        """Write a line like `log`, or count it; its kind is the event unless given.
+
+        Args:
+            event: name of the event.
+            level: of `logging`.
+            kind: that the line counts for.
+            error: add the traceback of the error that is handled.
+            facts: further members of the line.
+        """
         kind = kind or event
         now = self._clock()
         burst = float(self._burst)

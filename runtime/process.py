@@ -208,6 +208,9 @@ def tune(sock: socket.socket | None) -> None:
     A peer whose machine or network has died is thus gone after a minute instead of two
     hours, and with it whatever it held (control of the twin, memory of an upload).
     Harmless on sockets that are not TCP, and where the platform lacks an option.
+
+    Args:
+        sock: of a connection; None has no effect.
     """
     if sock is None or sock.family not in (socket.AF_INET, socket.AF_INET6):
         return

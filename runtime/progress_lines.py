@@ -17,7 +17,11 @@ one by one."""
 
 @contextmanager
 def told(what: str) -> Iterator[None]:
-    """Report work inside that takes long, to the log and so to standard error."""
+    """Report work inside that takes long, to the log and so to standard error.
+
+    Args:
+        what: the work, for the line.
+    """
     done = threading.Event()
     begun = time.monotonic()
     if begun > _last[1] + SILENT_S:

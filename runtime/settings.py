@@ -46,7 +46,14 @@ def option(default: object, *flags: str, public: bool = True, **details: Any) ->
 
 
 def parameters(settings: type[Settings]) -> dict[str, inspect.Parameter]:
-    """Convert a table's keys to options: parameters of a function that typer reads."""
+    """Convert a table's keys to options: parameters of a function that typer reads.
+
+    Args:
+        settings: class of the table.
+
+    Returns:
+        Field's name -> parameter.
+    """
     hints = get_type_hints(settings)
     found = {}
     helps = {n: h for kind in settings.__mro__[::-1] for n, h in described(kind)[1].items()}

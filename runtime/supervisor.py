@@ -154,6 +154,9 @@ class Supervisor:
     async def _keep(self, start: _Start) -> None:
         """Start a service whenever it ends.
 
+        Args:
+            start: the service and the events of its start.
+
         Raises:
             ServiceError: it left by itself at its first start.
         """
@@ -187,7 +190,11 @@ class Supervisor:
             await asyncio.sleep(pause)
 
     async def _spawn(self, service: Service) -> Process:
-        """Start a service's process; raise `_Ended` if the system has no room for it."""
+        """Start and record a service's process; raise `_Ended` if the system has no room.
+
+        Args:
+            service: with its command.
+        """
         try:
             process = await asyncio.create_subprocess_exec(
                 sys.executable,
@@ -207,6 +214,10 @@ class Supervisor:
 
     async def _ready(self, process: Process, start: _Start) -> None:
         """Wait until a service is ready; report the wait and the progress.
+
+        Args:
+            process: of the service.
+            start: the service and the events of its start.
 
         Raises:
             _Ended: before it was ready, or it no longer does anything.
@@ -246,7 +257,12 @@ class Supervisor:
             await asyncio.gather(ready, end, return_exceptions=True)
 
     async def _lines(self, process: Process, start: _Start) -> None:
-        """Read the address from the `bound` and `ready` lines, up to `ready`; skip others."""
+        """Read the address from the `bound` and `ready` lines, up to `ready`; skip others.
+
+        Args:
+            process: of the service.
+            start: the service and the events of its start.
+        """
         assert process.stdout is not None
         name = start.service.name
         while True:

@@ -35,7 +35,15 @@ CODES: Sequence[tuple[type[e.TwinError], Code]] = (
 
 def explain(error: Exception, root: Path | None = None) -> RpcError:
     """Convert `error` to the wire's error; paths below `root`, the data directory, become
-    relative to it."""
+    relative to it.
+
+    Args:
+        error: any exception.
+        root: data directory; None: paths stay as they are.
+
+    Returns:
+        The error; an internal one where `error` is none that users can cause.
+    """
     if root is not None:
         known = explain(error)
         message = from_root(known.message, root)

@@ -82,7 +82,15 @@ def peak_bytes() -> int:
 
 
 def answer(request: Sequence[bytes]) -> list[bytes]:
-    """Do one piece of work; return its parts after b"done", or how it failed."""
+    """Do one piece of work; return its parts after b"done", or how it failed.
+
+    Args:
+        request: seconds allowed, the pickled call, and its binary arguments.
+
+    Returns:
+        b"done" with the parts; b"refused" with code, message and data; b"memory";
+        b"failed" with the traceback.
+    """
     seconds, call, *raw = request
     # Before the call is unpickled, which imports modules.
     limit("RLIMIT_CPU", int(sum(os.times()[:2]) + float(seconds) + 2.0))

@@ -183,6 +183,14 @@ class Workers:
     async def ask(self, work: Work, *arguments: object, raw: Parts = ()) -> list[bytes]:
         """Have one piece of work done; it is stopped if this is cancelled.
 
+        Args:
+            work: function that a worker calls.
+            arguments: of the function.
+            raw: its binary arguments, which are not pickled.
+
+        Returns:
+            The parts that the function returns.
+
         Raises:
             RpcError: as `Worker.ask`.
         """

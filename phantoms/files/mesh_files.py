@@ -192,6 +192,9 @@ def read_part(path: str | os.PathLike[str]) -> trimesh.Trimesh:
     """Read the triangles of a machine's part [mm], from a GLB (m) or STL file (mm); they
     may be open.
 
+    Args:
+        path: of the file.
+
     Raises:
         PhantomError: no such file, its format, size or content; the message lists the
             allowed values.
@@ -264,7 +267,12 @@ def voxel_phantom(
 
 def _read(source: bytes | str | os.PathLike[str], file_type: str | None) -> tuple[bytes, str, str]:
     """Read a file, or take bytes; return content, format and label, with size
-    and format checked."""
+    and format checked.
+
+    Args:
+        source: path or content.
+        file_type: format; None: the path's suffix.
+    """
     if isinstance(source, bytes):
         raw = source
         label = "mesh"
@@ -369,7 +377,12 @@ def _check_glb(raw: bytes) -> None:
 
 
 def _check_gltf(document: Any, total: int) -> None:
-    """Check the JSON document of a GLB file of `total` bytes."""
+    """Check the JSON document of a GLB file of `total` bytes.
+
+    Args:
+        document: of the file's JSON part.
+        total: size of the file [bytes].
+    """
     for name in document.get("extensionsRequired", []):
         if not name.startswith(HARMLESS_EXTENSIONS):
             raise ValueError(f"it needs the extension {name[:80]!r}, which is not read here")
@@ -423,7 +436,12 @@ _CHECKS: Final = {"glb": _check_glb, "ply": _check_ply, "stl": _check_stl}
 
 
 def _closed(mesh: trimesh.Trimesh, label: str) -> trimesh.Trimesh:
-    """Merge vertices, check that the mesh is closed, and wind it outwards."""
+    """Merge vertices, check that the mesh is closed, and wind it outwards.
+
+    Args:
+        mesh: changed in place.
+        label: of the mesh, for messages.
+    """
     import trimesh
 
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
@@ -450,6 +468,12 @@ def _wound(faces: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     Every face has two nodes, as it is and turned; neighbours link those that agree. A
     body then falls into two components, mirror images of each other, and either is a
     consistent choice.
+
+    Args:
+        faces: (f, 3).
+
+    Returns:
+        The faces (f, 3), some reversed.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components

@@ -98,7 +98,12 @@ def _version(value: object, where: str) -> object:
 
 
 def _scene_file(document: Mapping[str, object], folder: Path | None) -> Phantom:
-    """Make the phantom of a scene: solids and meshes with their priorities."""
+    """Make the phantom of a scene: solids and meshes with their priorities.
+
+    Args:
+        document: of the file.
+        folder: where its meshes are; None: none may be named.
+    """
     given = reading.fields(
         document,
         "phantom",
@@ -127,6 +132,10 @@ def _scene_file(document: Mapping[str, object], folder: Path | None) -> Phantom:
 
 def require_replaced(phantom: Phantom, solids: object) -> None:
     """Check that the material that solids of a scene file replace is there, once.
+
+    Args:
+        phantom: of the scene's meshes and solids.
+        solids: of the document.
 
     Raises:
         PhantomError: names the material.
@@ -163,7 +172,16 @@ def solids_of(value: object, where: str) -> tuple[Solid, ...]:
 
 
 def _mesh(value: object, where: str, folder: Path | None) -> tuple[Phantom, float]:
-    """Read the mesh of a scene file and its priority."""
+    """Read the mesh of a scene file and its priority.
+
+    Args:
+        value: entry of the document.
+        where: its place, for messages.
+        folder: where the mesh's file is; None: none may be named.
+
+    Returns:
+        The mesh's phantom and priority.
+    """
     given = reading.fields(
         value,
         where,
@@ -196,7 +214,11 @@ def _unit(value: object, where: str) -> object:
 
 
 def _bead_file(document: Mapping[str, object]) -> Phantom:
-    """Make the phantom of a bead file: a body with beads, or with a spiral of them."""
+    """Make the phantom of a bead file: a body with beads, or with a spiral of them.
+
+    Args:
+        document: of the file.
+    """
     given = reading.fields(
         document,
         "phantom",

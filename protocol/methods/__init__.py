@@ -85,7 +85,13 @@ def openrpc_document(
 
 
 def _method(method: AnyMethod, schemas: Mapping[str, Any], result: str) -> dict[str, Any]:
-    """Describe one method as OpenRPC does; `result` is the reference to its schema."""
+    """Describe one method as OpenRPC does; `result` is the reference to its schema.
+
+    Args:
+        method: the method.
+        schemas: model's name -> its JSON schema.
+        result: reference to the schema of the result.
+    """
     schema = schemas[method.params.__name__]
     required = schema.get("required", [])
     params = []

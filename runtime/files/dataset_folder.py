@@ -226,6 +226,10 @@ def list_folder(path: Path) -> Folder:
 def read_text(path: Path, most: int = MAX_TEXT_BYTES) -> str:
     """Read a text file as UTF-8, else as the scanners' Western European code page.
 
+    Args:
+        path: of the file.
+        most: largest size [bytes].
+
     Raises:
         DatasetFormatError: it cannot be read or has more than `most` bytes.
     """
@@ -279,6 +283,11 @@ def read_values(
 ) -> npt.NDArray[np.uint16 | np.float32]:
     """Read one TIFF image (rows, cols), uint16 or, where `kinds` has an f, float32.
 
+    Args:
+        path: of the file.
+        shape: that the image must have; None: any.
+        kinds: of values that are allowed: u, f.
+
     Raises:
         DatasetMissingError: it is not there.
         DatasetFormatError: it is no such image.
@@ -308,6 +317,10 @@ def _decoded(path: Path, kinds: str) -> npt.NDArray[np.uint16 | np.float32]:
 
     A file of a few bytes may claim any size, and inflate to any: both are looked at
     before memory is taken.
+
+    Args:
+        path: of the file.
+        kinds: of values that are allowed: u, f.
     """
     import tifffile
 
@@ -394,6 +407,12 @@ def tiff_bytes(image: npt.NDArray[np.uint16]) -> bytes:
 
     The pixels begin at byte 8 and the tags follow them, as the scanner writes its files:
     some of its readers look for pixels there without reading the tags.
+
+    Args:
+        image: (rows, cols).
+
+    Returns:
+        The file's content.
     """
     rows, cols = image.shape
     pixels = image.astype("<u2", copy=False).tobytes()

@@ -204,6 +204,10 @@ class Directory:
         """Make a file of `size` bytes whose blocks are reserved on the disk, in
         place of its namesake.
 
+        Args:
+            name: of the file.
+            size: [bytes].
+
         Raises:
             OSError: the system refuses, as for want of room; then there is no such file.
         """
@@ -434,7 +438,13 @@ class Directory:
 
     def _store(self, fd: int | None, name: str, data: memoryview) -> None:
         """Write a file under a temporary name, flush it and rename it; nothing is
-        left of a failure."""
+        left of a failure.
+
+        Args:
+            fd: descriptor of the folder; None where the system has none.
+            name: of the file.
+            data: its content.
+        """
         temporary, file = self._temporary(fd, 0o644)
         try:
             try:

@@ -278,6 +278,12 @@ def lock_folder(root: Directory) -> Callable[[], None]:
     a twin runs, or replaced by a link beforehand. The system releases it when its holder
     dies. Without effect where a directory cannot be opened (Windows) or locked.
 
+    Args:
+        root: the data directory.
+
+    Returns:
+        The function that releases the lock.
+
     Raises:
         DatasetWriteError: another process holds the lock.
     """

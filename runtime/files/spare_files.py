@@ -51,7 +51,12 @@ class SpareFiles:
             self._refill()
 
     def _keep_in_spare(self, name: str, data: bytes) -> bool:
-        """Write a document into a spare file and rename it; False if there is none."""
+        """Write a document into a spare file and rename it; False if there is none.
+
+        Args:
+            name: of the document.
+            data: its content.
+        """
         for spare in sorted(self._there):
             self._there.discard(spare)
             if not self._usable(spare):  # another name of the document, from a change taken back

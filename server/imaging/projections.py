@@ -380,7 +380,12 @@ class Imaging:
             apart.users -= 1
 
     async def _taken_apart(self, sample: Sample, pieces: Pieces) -> _Apart:
-        """Divide the sample as it is now, or reuse its pieces; with `_sending` held."""
+        """Divide the sample as it is now, or reuse its pieces; with `_sending` held.
+
+        Args:
+            sample: on the stage, or of a scan.
+            pieces: whether into materials or into parts.
+        """
         key = (_name(sample), pieces)
         phantom = await asyncio.to_thread(self.samples.load, sample.name, sample.material)
         apart = self._known.pop(key, None)
@@ -427,7 +432,12 @@ class Imaging:
 
     async def _put(self, name: str, body: Body) -> str:
         """Ensure that the projector has the present version of a body; return
-        its name there."""
+        its name there.
+
+        Args:
+            name: of the body here.
+            body: scene, mesh or volume.
+        """
         named = f"{name} #{await asyncio.to_thread(digest_of, body)}"
         versions = self._versions.setdefault(name, [])
         if named not in versions:

@@ -170,7 +170,14 @@ class ProjectorClient:
 
 
 async def _send(channel: ProjectorLink, name: str, value: Body, how: Mapping[str, object]) -> None:
-    """Send a volume or mesh in chunks, or a scene; `how` are further parameters."""
+    """Send a volume or mesh in chunks, or a scene; `how` are further parameters.
+
+    Args:
+        channel: connection to the projector.
+        name: of the body there.
+        value: the body.
+        how: further parameters of `volume.put`.
+    """
     if isinstance(value, Scene):
         await channel.ask("volume.put", {"name": name, "scene": scene_to_dict(value), **how})
         return

@@ -192,7 +192,12 @@ class ProjectorPool:
     def _begin(
         self, member: _Member, asking: Coroutine[Any, Any, Float32Array | None]
     ) -> asyncio.Task[Float32Array | None]:
-        """Start a request in a task that releases the projector however it ends."""
+        """Start a request in a task that releases the projector however it ends.
+
+        Args:
+            member: the projector.
+            asking: the request.
+        """
 
         def ended(task: asyncio.Task[Float32Array | None]) -> None:
             """Release the projector and wake a waiting request."""
@@ -217,7 +222,18 @@ class ProjectorPool:
         views: ConeVec | None,
         shape: tuple[int, int],
     ) -> Float32Array | None:
-        """Send a request to one projector; measure its pace, or let it rest after a failure."""
+        """Send a request to one projector; measure its pace, or let it rest after a failure.
+
+        Args:
+            member: the projector.
+            name: of the body.
+            value: the body; None for a request that sends none.
+            views: to project; None for none.
+            shape: (rows, cols) of the images.
+
+        Returns:
+            Line integrals (n, rows, cols); None without views.
+        """
         loop = asyncio.get_running_loop()
         try:
             if member.kind is None:

@@ -70,7 +70,11 @@ class ProjectorWatch:
             await asyncio.sleep(self.every_s)
 
     async def _look(self, client: Watched) -> None:
-        """Ask once and wait for the answer; report a late one."""
+        """Ask once and wait for the answer; report a late one.
+
+        Args:
+            client: of the projector.
+        """
         asked = asyncio.ensure_future(client.health())
         try:
             if not (await asyncio.wait([asked], timeout=self.silent_s))[0]:

@@ -74,7 +74,8 @@ def with_spectra(machine: Machine, physics: Physics) -> Machine:
     """
     if physics == "ideal":
         return machine
-    tube, (least, most) = machine.tube, voltages()
+    tube = machine.tube
+    least, most = voltages()
     low = max(least, tube.min_kV)
     high = min(most, tube.max_kV)
     if not low <= tube.kV <= high:

@@ -156,7 +156,15 @@ class Outbox:
 
 
 def _not_finite(value: object, path: str = "$") -> str | None:
-    """Find the path of the first number that JSON cannot represent, for the log."""
+    """Find the path of the first number that JSON cannot represent, for the log.
+
+    Args:
+        value: of a message.
+        path: to the value.
+
+    Returns:
+        Path and number; None if all are finite.
+    """
     match value:
         case float():
             if math.isfinite(value):

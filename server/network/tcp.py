@@ -201,7 +201,11 @@ class _Link(asyncio.BufferedProtocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Set up a new connection, which waits for a place; open its session
-        without a token."""
+        without a token.
+
+        Args:
+            transport: of the connection.
+        """
         self.transport = cast(asyncio.Transport, transport)
         self.loop = asyncio.get_running_loop()
         self.server.opened += 1
@@ -247,7 +251,11 @@ class _Link(asyncio.BufferedProtocol):
         self.data_received(bytes(self.read[:nbytes]))
 
     def data_received(self, data: bytes) -> None:
-        """Divide received bytes into messages; find E-stops at once, other urgent ones soon."""
+        """Divide received bytes into messages; find E-stops at once, other urgent ones soon.
+
+        Args:
+            data: any part of the stream.
+        """
         before = self.wire.waiting
         self.wire.feed(data)
         if self.wire.waiting > before:  # before an E-stop is taken out
@@ -274,7 +282,11 @@ class _Link(asyncio.BufferedProtocol):
         found: list[Coroutine[object, object, None]] = []
 
         def wanted(raw: bytes) -> bool:
-            """Decode a message and start it if it is urgent; return whether to take it out."""
+            """Decode a message and start it if it is urgent; return whether to take it out.
+
+            Args:
+                raw: the message as received.
+            """
             if len(raw) > MAX_INLINE_BYTES:
                 return False  # it costs more than a look; it is urgent in its turn
             message = self.wire.decode(raw)
@@ -310,7 +322,11 @@ class _Link(asyncio.BufferedProtocol):
         return self.transport.get_extra_info("ssl_object") is None
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Cancel the work of an ended connection and close its session."""
+        """Cancel the work of an ended connection and close its session.
+
+        Args:
+            exc: the reason, not used.
+        """
         self.deadlines.clear()
         for task in (*self.tasks, *([self.worker] if self.worker else [])):
             task.cancel()
@@ -394,7 +410,14 @@ class _Link(asyncio.BufferedProtocol):
             self.abort("the application did not open a session")
 
     def _lane(self, message: m.Message | parts.Frozen) -> int:
-        """Determine the lane of a message: an E-stop's, an urgent one, the ordinary."""
+        """Determine the lane of a message: an E-stop's, an urgent one, the ordinary.
+
+        Args:
+            message: a call or a batch, which has the lane of its most urgent item.
+
+        Returns:
+            A lane of `loop_turns`.
+        """
         name = ""
         match message:
             case m.Batch(items):
@@ -573,7 +596,17 @@ class _Link(asyncio.BufferedProtocol):
         )
 
     async def _try(self, id: m.Id, name: str, given: Given, trace: str) -> m.Response | m.Failure:
-        """Check token, rate, place and parameters of a call, and have the session handle it."""
+        """Check token, rate, place and parameters of a call, and have the session handle it.
+
+        Args:
+            id: of the request; None for a notification.
+            name: of the method.
+            given: parameters, or the error in them.
+            trace: id of the call in the log.
+
+        Returns:
+            The result, or any failure as an answer.
+        """
         try:
             if not self.let_in and name != HELLO:
                 raise errors.not_authorised()

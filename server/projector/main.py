@@ -19,7 +19,11 @@ from flexdt.runtime.settings import parse
 
 
 async def run(options: ProjectorSettings) -> int:
-    """Serve until SIGTERM or SIGINT; return the exit code."""
+    """Serve until SIGTERM or SIGINT; return the exit code.
+
+    Args:
+        options: of the process.
+    """
     from flexdt.runtime.http_pages import Requests, served_pages
     from flexdt.server.projector.compute import backend, begin
     from flexdt.server.projector.service import projector_pages, serve_projector

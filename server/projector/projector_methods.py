@@ -39,7 +39,8 @@ Answer = Callable[[Context, JobClient, Id, Any], Awaitable[object]]
 
 
 async def hello(context: Context, client: JobClient, id: Id, p: Hello) -> object:
-    """Check the token and admit the client; return the server's version and instance."""
+    """Check the token, admit the client and end its hello timeout; return the server's
+    version and instance."""
     await client.token_check.check(p.token, client.link.peer)
     client.let_in = True
     client.link.deadlines.stop("hello")
@@ -53,7 +54,17 @@ async def hello(context: Context, client: JobClient, id: Id, p: Hello) -> object
 
 
 async def volume_put(context: Context, client: JobClient, id: Id, p: wire.VolumePut) -> object:
-    """Store a scene, or a chunk of voxels or of a mesh; prepare a complete volume."""
+    """Store a scene, or a chunk of voxels or of a mesh; prepare a complete volume.
+
+    Args:
+        context: of the server.
+        client: that sends it.
+        id: of the request.
+        p: parameters.
+
+    Returns:
+        name, received and total [bytes], and complete.
+    """
     if p.scene is not None:
         context.store.put(p.name, scene_from_dict(p.scene), evictable=p.evictable)
         return {"name": p.name, "received": 0, "total": 0, "complete": True}
@@ -97,7 +108,18 @@ async def volume_remove(context: Context, client: JobClient, id: Id, p: wire.Vol
 
 async def project(context: Context, client: JobClient, id: Id, p: wire.Project) -> object:
     """Compute line integrals, block of views by block; replace a waiting request of
-    the same key."""
+    the same key.
+
+    Args:
+        context: of the server.
+        client: that asks.
+        id: of the request.
+        p: parameters.
+
+    Returns:
+        The image value; type, shape and number of parts where the views were sent in
+        parts.
+    """
     volume = context.store.get(p.volume)
     view = math.prod(p.detector)
     if 4 * view > MAX_VIEW_BYTES:
@@ -122,7 +144,18 @@ async def project(context: Context, client: JobClient, id: Id, p: wire.Project) 
 
 
 async def backproject(context: Context, client: JobClient, id: Id, p: wire.Backproject) -> object:
-    """Compute the adjoint, and answer it or add it to a named volume."""
+    """Compute the adjoint, and answer it or add it to a named volume.
+
+    Args:
+        context: of the server.
+        client: that asks.
+        id: of the request.
+        p: parameters.
+
+    Returns:
+        The image value; type, shape and number of parts where it was sent in parts or
+        added.
+    """
     if len(p.projections) != len(p.cone_vec):
         raise invalid_params(
             f"{len(p.projections)} projections and {len(p.cone_vec)} rows of cone_vec"
@@ -139,7 +172,14 @@ async def backproject(context: Context, client: JobClient, id: Id, p: wire.Backp
 
 
 async def health(context: Context, client: JobClient, id: Id, p: Params) -> object:
-    """Return figures about the server."""
+    """Return figures about the server.
+
+    Args:
+        context: of the server.
+        client: that asks.
+        id: of the request.
+        p: none.
+    """
     return {
         "instance": context.instance,
         "version": version("flexdt"),

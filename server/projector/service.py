@@ -125,7 +125,12 @@ class ProjectorServer(ListeningServer):
 
     def frame(self, link: FrameLink, body: memoryview) -> None:
         """Serve a client's frame in a task; refuse it from one with too many, or
-        without a token."""
+        without a token.
+
+        Args:
+            link: connection of the client.
+            body: frame without its length.
+        """
         client = self.context.clients[link]
         if len(client.tasks) >= self.limits.max_waiting:
             self.refuse(link, errors.busy("too many requests under way"))
@@ -144,7 +149,12 @@ class ProjectorServer(ListeningServer):
     # -- requests ----------------------------------------------------------------------------
 
     async def _serve(self, client: JobClient, body: memoryview) -> None:
-        """Decode a frame, answer its request and release the client's lane."""
+        """Decode a frame, answer its request and release the client's lane.
+
+        Args:
+            client: that sent it.
+            body: frame without its length.
+        """
         request: m.Id = None
         link = client.link
         calls = client.calls
@@ -196,7 +206,17 @@ class ProjectorServer(ListeningServer):
     async def _try(
         self, client: JobClient, id: m.Id, name: str, given: Given
     ) -> m.Response | m.Failure:
-        """Check token, parameters and place of a call, and answer it."""
+        """Check token, parameters and place of a call, and answer it.
+
+        Args:
+            client: that asks.
+            id: of the request; None for a notification.
+            name: of the method.
+            given: parameters, or the error in them.
+
+        Returns:
+            The result, or any failure as an answer.
+        """
         try:
             if not client.let_in and name != HELLO:
                 raise errors.not_authorised()
@@ -286,7 +306,12 @@ async def serve_projector(
 
 
 def projector_pages(server: ProjectorServer, requests: Requests) -> Pages:
-    """Make the monitoring pages of a running projector."""
+    """Make the monitoring pages of a running projector.
+
+    Args:
+        server: whose figures they show.
+        requests: counted calls.
+    """
     context = server.context
 
     def health() -> dict[str, object]:

@@ -131,6 +131,13 @@ class VolumeStore:
 
         Chunks come in order. The complete volume is not stored: `put` does that.
 
+        Args:
+            owner: client that sends it.
+            name: of the volume.
+            what: size of the complete volume or mesh.
+            start: place of the chunk [bytes].
+            data: the chunk.
+
         Returns:
             Bytes received so far and, once all have come, the function that makes the
             volume or mesh.
@@ -233,7 +240,12 @@ def _bad_chunk(name: str, asked: int, allowed: int) -> RpcError:
 
 
 def _info(name: str, value: Body) -> wire.VolumeInfo:
-    """Describe a volume, mesh or scene."""
+    """Describe a volume, mesh or scene.
+
+    Args:
+        name: of the body.
+        value: the body.
+    """
     if isinstance(value, TriangleMesh):
         triangles = len(value.faces)
         return wire.VolumeInfo(name=name, kind="mesh", bytes=memory_of(value), triangles=triangles)

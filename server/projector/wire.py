@@ -103,7 +103,11 @@ class FrameLink(asyncio.BufferedProtocol):
         return target[self._filled :]
 
     def buffer_updated(self, count: int) -> None:
-        """Count received bytes; pass a complete frame to `on_frame`."""
+        """Count received bytes; pass a complete frame to `on_frame`.
+
+        Args:
+            count: number of bytes.
+        """
         if self._over:
             return
         self._filled += count
@@ -298,7 +302,16 @@ class ProjectorLink:
     async def _request(
         self, method: str, params: Mapping[str, object], shape: tuple[int, ...] | None
     ) -> tuple[object, npt.NDArray[np.float32] | None]:
-        """Send a request and wait for its answer and parts; cancel it if this is cancelled."""
+        """Send a request and wait for its answer and parts; cancel it if this is cancelled.
+
+        Args:
+            method: its name on the wire.
+            params: its parameters.
+            shape: of the array that comes in parts; None for none.
+
+        Returns:
+            The result, and the array of its parts, or None.
+        """
         pending = _Pending(asyncio.get_running_loop().create_future(), shape)
         request = self._calls.request(method, params, pending, current()[:100])
         sent = False

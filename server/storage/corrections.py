@@ -128,6 +128,12 @@ class Corrections:
     ) -> NamedCorrection:
         """Make a correction from edge values [mm, deg]; nothing is stored yet.
 
+        Args:
+            values: parameter -> value [mm, deg].
+            name: of the correction; None: one that follows from its date.
+            note: for people.
+            when: its date; None: now.
+
         Raises:
             UnknownNameError: a name that is not a parameter.
             RpcError: -32602, the name is taken; corrections are never edited.

@@ -58,7 +58,17 @@ class UsedBytes:
         return 0
 
     def _count(self, folder: Directory, name: str, changed_ns: int, there: dict[str, _Seen]) -> int:
-        """Sum up a folder, reusing what is known of unchanged ones; record them in `there`."""
+        """Sum up a folder, reusing what is known of unchanged ones; record them in `there`.
+
+        Args:
+            folder: that contains it.
+            name: of the folder.
+            changed_ns: its time of modification [ns].
+            there: folder -> what was counted; changed.
+
+        Returns:
+            Bytes.
+        """
         seen = self._seen.get(name)
         # A change within the clock's grain does not show: a young folder is read again.
         old = time.time_ns() - changed_ns > MIN_SETTLED_NS

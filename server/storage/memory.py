@@ -223,7 +223,11 @@ class StateStore:
             self._at_once.set()
 
     async def run(self, moving: Callable[[], bool]) -> None:
-        """Write until cancelled; `moving` returns whether positions are changing."""
+        """Write until cancelled; `moving` returns whether positions are changing.
+
+        Args:
+            moving: function that tells it.
+        """
         while True:
             if not moving():
                 await self._changed.wait()

@@ -209,7 +209,12 @@ def _place(root: Directory, name: str) -> tuple[Path, tuple[object, ...]]:
 
 
 def _scan(folder: files.Folder, most: int) -> _Scan:
-    """Read a folder: its document of at most `most` bytes, else the scanner's texts."""
+    """Read a folder: its document of at most `most` bytes, else the scanner's texts.
+
+    Args:
+        folder: of a data set.
+        most: largest size of the document [bytes].
+    """
     try:
         if folder.document is None:
             raise ds.DatasetMissingError(
@@ -270,7 +275,13 @@ def _kept_scan(path: Path, key: tuple[object, ...]) -> _Scan:
 
 
 def _info(path: Path, modified: float, scan: _Scan) -> p.DatasetInfo:
-    """Summarise a data set."""
+    """Summarise a data set.
+
+    Args:
+        path: of the data set.
+        modified: its time of modification [s].
+        scan: its content.
+    """
     folder = scan.folder
     document = scan.document
     kV, power_W = scan.beam
@@ -332,7 +343,14 @@ def _info(path: Path, modified: float, scan: _Scan) -> p.DatasetInfo:
 def _list(
     root: Directory, asked: p.DatasetList, around: TwinContext, codec: Codec
 ) -> p.DatasetListResult:
-    """Answer dataset.list: the data sets that match the search, within the time limit."""
+    """Answer dataset.list: the data sets that match the search, within the time limit.
+
+    Args:
+        root: data directory.
+        asked: search, range and thumbnails.
+        around: jobs and machine of the twin.
+        codec: of the connection.
+    """
     folders = []
     left_out = 0
     with root.entries() as entries:
@@ -404,7 +422,17 @@ def _listed(path: Path, modified: float) -> p.DatasetInfo | str:
 
 
 def _with_thumbnail(root: Directory, info: p.DatasetInfo, side: int, until: float) -> p.DatasetInfo:
-    """Add a thumbnail to a summary, unless the time is over."""
+    """Add a thumbnail to a summary, unless the time is over.
+
+    Args:
+        root: data directory.
+        info: the summary.
+        side: largest side of the thumbnail [pixels].
+        until: monotonic time after which no thumbnail is made [s].
+
+    Returns:
+        The summary, with a thumbnail if there is one.
+    """
 
     def make() -> ImageValue | str:
         """Make the thumbnail of the middle projection; "" if there is none."""
@@ -440,7 +468,14 @@ def _with_thumbnail(root: Directory, info: p.DatasetInfo, side: int, until: floa
 def _get(
     root: Directory, asked: p.DatasetGet, around: TwinContext, codec: Codec
 ) -> p.DatasetResult:
-    """Answer dataset.get: settings, poses over time, and the other requested parts."""
+    """Answer dataset.get: settings, poses over time, and the other requested parts.
+
+    Args:
+        root: data directory.
+        asked: name and parts.
+        around: jobs and machine of the twin.
+        codec: of the connection.
+    """
     scan = _opened(root, asked.name)
     folder = scan.folder
     images = scan.images
@@ -491,7 +526,16 @@ def _script(folder: files.Folder) -> str:
 
 
 def _measured(scan: _Scan, at: tuple[int, ...]) -> dict[str, Any]:
-    """Compute mean counts and clearances of images; late ones come with the next request."""
+    """Compute mean counts and clearances of images; late ones come with the next request.
+
+    Args:
+        scan: the data set.
+        at: indices of images.
+
+    Returns:
+        counts, clearance_mm and clearance_of of the result; None for what is late or
+        missing.
+    """
     until = time.monotonic() + MEASURE_S
     counts: list[float | None] = []
     for i in at:
@@ -518,7 +562,15 @@ def _mean(path: Path, key: tuple[object, ...]) -> float:
 
 @lru_cache(4)
 def _clearances(scan: _Scan, at: tuple[int, ...]) -> tuple[list[float | None], str]:
-    """Compute the smallest clearance of images [mm], and describe the scene."""
+    """Compute the smallest clearance of images [mm], and describe the scene.
+
+    Args:
+        scan: with its document.
+        at: indices of images.
+
+    Returns:
+        Clearances, None where nothing is near, and a description of the scene.
+    """
     from flexdt.twin.collision.collision_scene import build_scene
     from flexdt.twin.collision.convex_solids import UprightCylinder
     from flexdt.twin.collision.first_contact import clearance
@@ -547,7 +599,14 @@ def _clearances(scan: _Scan, at: tuple[int, ...]) -> tuple[list[float | None], s
 def _frame(
     root: Directory, asked: p.DatasetFrame, around: TwinContext, codec: Codec
 ) -> p.DatasetFrameResult:
-    """Answer dataset.frame: one image, normalised and binned as requested."""
+    """Answer dataset.frame: one image, normalised and binned as requested.
+
+    Args:
+        root: data directory.
+        asked: image, kind and binning.
+        around: jobs and machine of the twin.
+        codec: of the connection, which limits the size.
+    """
     scan = _opened(root, asked.name)
     folder = scan.folder
     document = scan.document

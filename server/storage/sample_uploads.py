@@ -79,6 +79,11 @@ class Incoming:
         A chunk that has come before is passed over, so a client may send it again; a
         chunk at 0 of another file under the same name begins a new upload.
 
+        Args:
+            head: description of the upload.
+            start: place of the chunk [bytes].
+            data: the chunk.
+
         Raises:
             LimitError: a gap before this chunk, or the upload was dropped for newer ones.
             DiskFullError: it would leave no room for state and jobs.

@@ -19,7 +19,15 @@ from flexdt.twin.scanner.state import NamedCorrection, Sample, StagePlacement
 def save_scene(
     scanner: ScannerTwin, now: float, *, name: str = "", saved: str = "", version: str = ""
 ) -> p.Scene:
-    """Convert the scanner to a document; a motor under way is saved at its target."""
+    """Convert the scanner to a document; a motor under way is saved at its target.
+
+    Args:
+        scanner: whose state is saved.
+        now: twin time [s].
+        name: of the scene.
+        saved: moment, ISO 8601.
+        version: of flexdt.
+    """
     return p.Scene(
         schema=1,
         flexdt=version,

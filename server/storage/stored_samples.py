@@ -174,6 +174,11 @@ class SampleStore:
     def receive(self, head: UploadHead, start: int, data: bytes) -> int:
         """Receive a chunk, see `Incoming.receive`; return the bytes received so far.
 
+        Args:
+            head: description of the upload.
+            start: place of the chunk [bytes].
+            data: the chunk.
+
         Raises:
             RpcError: -32008, larger than allowed.
             LimitError: a gap before this chunk, or a name with another meaning.
@@ -269,8 +274,8 @@ class SampleStore:
                 self._folder.unlink(file)
 
     def _settle(self) -> None:
-        """Clean the folder at the start: delete bytes without an upload, and the
-        rest of killed writers."""
+        """Clean the folder at the start: delete the files of interrupted writers, and bytes
+        without an upload unless its damaged description is kept."""
         self._folder.sweep([TEMPORARY])
         known = {_bytes_file(name, head.revision) for name, head in self._heads.items()}
         there = self._folder.names()
@@ -283,7 +288,18 @@ class SampleStore:
     def _load(
         self, head: UploadHead | None, name: str, material: str | None
     ) -> tuple[Phantom, str | None]:
-        """Load a phantom, and the revision of an upload."""
+        """Load a phantom, and the revision of an upload.
+
+        Args:
+            head: description of the upload; None for a shipped phantom.
+            name: of the sample.
+            material: of an uploaded mesh; None: that of its description.
+
+        Raises:
+            LimitError: a material for a shipped phantom.
+            UnknownNameError: no such sample.
+            PhantomError: an upload that cannot be read.
+        """
         if head is None:
             if material is not None:
                 raise LimitError(
@@ -300,7 +316,11 @@ class SampleStore:
         return phantom, _revision(head, raw)
 
     def _bytes(self, head: UploadHead) -> bytes:
-        """Read the bytes of an upload; a damaged one is set aside and raises."""
+        """Read the bytes of an upload; a damaged one is set aside and raises.
+
+        Args:
+            head: description of the upload.
+        """
         stored = head.revision
         file = _bytes_file(head.name, stored)
         try:
@@ -342,7 +362,18 @@ def _shown(head: UploadHead, revision: str) -> str:
 
 
 def _parse(head: UploadHead, raw: bytes, material: str | None) -> Phantom:
-    """Parse the bytes of an upload: mesh or scene in a worker, voxels here."""
+    """Parse the bytes of an upload: mesh or scene in a worker, voxels here.
+
+    Args:
+        head: description of the upload.
+        raw: its bytes.
+        material: of a mesh, or that fills voxels; None: the default of a mesh, or
+            attenuation as uploaded.
+
+    Raises:
+        PhantomError: voxels of another size, or not finite; a mesh or scene that cannot be
+            read.
+    """
     if head.kind == "mesh":
         return mesh_apart(
             raw,

@@ -77,6 +77,9 @@ def tables() -> Tables:
 def stored_arrays(file: str) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Load the arrays of a file of this package by name, numbers as float64, read-only.
 
+    Args:
+        file: its name in the package's folder `data`.
+
     Returns:
         (name -> array, provenance).
     """
@@ -205,6 +208,9 @@ def _mass_at(row: int, energy_keV: float) -> float:
 
 def parse_formula(formula: str) -> dict[str, float]:
     """Parse a formula to symbol -> number of atoms. Parentheses and decimal counts are allowed.
+
+    Args:
+        formula: such as CaSO4(H2O)2.
 
     Raises:
         LimitError: it cannot be read; names the place.

@@ -91,7 +91,14 @@ class _Piece:
 
 
 def _best_cut(piece: _Piece) -> Sequence[_Piece] | None:
-    """Find the halves of the best of a few cuts; None if none is worthwhile."""
+    """Find the halves of the best of a few cuts; None if none is worthwhile.
+
+    Args:
+        piece: with its triangles and hull.
+
+    Returns:
+        The two halves of the least volume, from cuts at quarters along each axis.
+    """
     points = piece.hull.vertices
     best = None
     wanted = MAX_VOLUME_SHARE * piece.volume

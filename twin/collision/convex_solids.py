@@ -139,10 +139,13 @@ def box(size: npt.ArrayLike, center: npt.ArrayLike = (0.0, 0.0, 0.0)) -> Polytop
 
 
 def hull(points: npt.ArrayLike) -> Polytope:
-    """Compute the convex hull of `points` (k, 3) [mm].
+    """Compute the convex hull of points.
 
     Flat or thin point sets are thickened by a micrometre, outwards, so that every hull is
     a solid.
+
+    Args:
+        points: (k, 3) [mm].
     """
     from scipy.spatial import ConvexHull, QhullError
 

@@ -132,7 +132,11 @@ class PathSearch:
         return SweepResult(contact, contact.clearance_mm, contact.pair, looks=looks)
 
     def refined(self, guess: SweepResult) -> SweepResult:
-        """Refine the least clearance of a free path, from a guess."""
+        """Refine the least clearance of a free path, from a guess.
+
+        Args:
+            guess: result of a sweep that found no contact.
+        """
         best = guess.min_clearance_mm
         nearest = guess.nearest
         looks = guess.looks
@@ -148,7 +152,12 @@ class PathSearch:
         return SweepResult(None, best, nearest, looks=looks)
 
     def contact(self, k: int, found: PairResult) -> Contact:
-        """Convert the contact of pair k to the scene's terms."""
+        """Convert the contact of pair k to the scene's terms.
+
+        Args:
+            k: index of the pair.
+            found: result of the pair's sweep.
+        """
         motion = self.motion(k)
         at = START if found.contact is None else found.contact
         time = motion.time(at)

@@ -121,7 +121,15 @@ class _Planner:
         return motion.move(start, 0.0, end, *self.pace(axis), 0.0).duration
 
     def stations(self, goal: Mapping[str, float]) -> dict[str, list[float]]:
-        """List positions worth a stop for the goal's motors and those of the obstacles."""
+        """List positions worth a stop for the goal's motors and those of the obstacles.
+
+        Args:
+            goal: motor -> target [mm, deg].
+
+        Returns:
+            Motor -> positions: where it is, its target, limits, home, middle, or turns
+            aside.
+        """
         chains = [
             body.slides.any(axis=1) | (body.turns != 0.0)
             for body in self.scene.bodies
@@ -148,6 +156,10 @@ class _Planner:
         self, stations: Mapping[str, Sequence[float]], goal: Mapping[str, float]
     ) -> list[tuple[str, float]] | None:
         """Search for the quickest free path over stations (A*), one motor at a time.
+
+        Args:
+            stations: motor -> positions that are tried [mm, deg].
+            goal: motor -> target [mm, deg]; the others return to where they are.
 
         Returns:
             (motor, position) in order; None if there is none within `MAX_SWEEPS`.
@@ -190,7 +202,12 @@ class _Planner:
     def shortened(
         self, way: list[tuple[str, float]], goal: Mapping[str, float]
     ) -> list[tuple[str, float]]:
-        """Shorten the excursions of a path as far as it stays free."""
+        """Shorten the excursions of a path as far as it stays free.
+
+        Args:
+            way: (motor, position) in order, free.
+            goal: motor -> target [mm, deg]; moves to it are not changed.
+        """
         for i, (axis, value) in enumerate(way):
             earlier = [v for a, v in way[:i] if a == axis]
             before = earlier[-1] if earlier else self.at(axis)

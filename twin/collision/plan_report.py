@@ -111,7 +111,15 @@ def _contacts(search: PathSearch) -> list[Contact]:
 
 
 def _contacts_of(search: PathSearch, k: int) -> list[Contact]:
-    """Find the contacts of one pair; after each it must come free before it counts again."""
+    """Find the contacts of one pair; after each it must come free before it counts again.
+
+    Args:
+        search: path and pairs.
+        k: index of the pair.
+
+    Returns:
+        At most `MAX_CONTACTS`, in order of time.
+    """
     motion = search.motion(k)
     limits = search.scene.limits
     separate = search.scene.separation(search.pairs[k])
@@ -133,7 +141,17 @@ def _contacts_of(search: PathSearch, k: int) -> list[Contact]:
 
 
 def _line(plan: ScanPlan, scene: CollisionScene, contact: Contact) -> int:
-    """Find the line of the last motion under way at the contact that moves one of the two."""
+    """Find the line of the last motion under way at the contact that moves one of the two.
+
+    Args:
+        plan: with its steps.
+        scene: which motors move which bodies.
+        contact: of one pair.
+
+    Returns:
+        Line of the script; that of the last step begun where no motion is under way, or
+        0.
+    """
     pairs = [scene.names(pair) == contact.pair for pair in scene.all.pairs]
     motors = {scene.axes[i] for i in np.flatnonzero(scene.all.moves[pairs].any(axis=0))}
     under_way = [

@@ -99,6 +99,12 @@ class Path:
 def path_of(axes: Sequence[str], tables: Mapping[str, AxisPath], start: float, end: float) -> Path:
     """Make the path of `axes` from `start` to `end` [s].
 
+    Args:
+        axes: names of the motors, in the order of the columns.
+        tables: motor -> positions and velocities over time.
+        start: of the path [s].
+        end: of the path [s].
+
     Raises:
         KeyError: a motor has no table.
         ValueError: a motor jumps; a sweep over it would prove nothing.
@@ -205,7 +211,17 @@ class _Bound:
         self, at: Moment, lengths: FloatArray, value: float, level: float
     ) -> Moment | None:
         """Find the first moment from `at` on at which the bound, being `value`
-        there, reaches `level`."""
+        there, reaches `level`.
+
+        Args:
+            at: segment, and time in it [s].
+            lengths: of all segments (n,) [s].
+            value: of the bound at `at`.
+            level: below `value`.
+
+        Returns:
+            The moment; None if the bound stays above `level`.
+        """
         lengths = lengths[at.segment :].copy()
         lengths[0] -= at.dt
         rate = self.rate[at.segment :].copy()
@@ -385,6 +401,10 @@ class RelativeMotion:
         """Find the first moment after a look at which the gap may have fallen to `level` [mm].
 
         `level` is below the look's gap. None if the gap stays above it to the end.
+
+        Args:
+            look: a distance evaluation.
+            level: gap below the look's [mm].
         """
         bound = self._slide(look.normal)
         horizons = []

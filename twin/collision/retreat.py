@@ -67,7 +67,13 @@ def leaving(scene: CollisionScene, path: Path) -> Contact | None:
 
 def _of_pair(scene: CollisionScene, path: Path, pair: Pair) -> Contact | None:
     """Find the contact that stops one overlapping pair: coming closer, or touching
-    again once free."""
+    again once free.
+
+    Args:
+        scene: the bodies.
+        path: of all motors.
+        pair: of bodies that overlap at the beginning.
+    """
     a, b = (scene.bodies[i] for i in pair)
     motion = RelativeMotion(a, b, path)
     overlap = _Overlap.at(a, b, path.q[0])
@@ -179,6 +185,11 @@ class _Overlap:
         The width is negative for an overlap, and never too large. Looked at are
         directions that turn with either body. How far that body reaches across them does
         not change, so that one of many corners costs no more than another.
+
+        Args:
+            offset: from b's origin to a's (3,) [mm].
+            turn_a: orientation of a (3, 3); None for a body that never turns.
+            turn_b: orientation of b, likewise.
         """
         turned = (np.eye(3) if turn_a is None else turn_a, np.eye(3) if turn_b is None else turn_b)
         off = (np.abs(now - then).max() for now, then in zip(turned, self.turned, strict=True))
@@ -203,7 +214,11 @@ class _Overlap:
         return self.separate(at_a - at_b, turn_a, turn_b)[0]
 
     def _refined(self, q: FloatArray) -> FloatArray:
-        """Search for the direction (1, 3) of the widest gap, where no faces give it exactly."""
+        """Search for the direction (1, 3) of the widest gap, where no faces give it exactly.
+
+        Args:
+            q: positions of all motors (axes,) [mm, rad].
+        """
         (_, at_a), (_, at_b) = (_pose(body, q) for body in self.bodies)
 
         def gaps(directions: FloatArray) -> FloatArray:

@@ -37,10 +37,13 @@ def separation_of(
 ) -> Callable[[FloatArray, FloatArray | None, FloatArray | None], Separation]:
     """Make a function that computes the certified separation of `a` from `b`.
 
+    Args:
+        a: solid in its own frame.
+        b: the other, in its own frame.
+
     Returns:
         A function of the vector from b's origin to a's (3,) [mm] and of the orientations
-        of a and
-        b (3, 3), None for a body that never turns.
+        of a and b (3, 3), None for a body that never turns.
     """
     import fcl
 

@@ -169,6 +169,12 @@ def sample_bodies(
     A point b of a piece is at c + T R(alpha + angle_scale * angle) (b + mount - tau), the
     map of `Poses.cone_vec`; a piece is as large as all that a stage on the turntable can
     sweep with it.
+
+    Args:
+        machine: whose component holds the sample.
+        profile: offsets of its motors.
+        sample: convex pieces in the sample's frame [mm].
+        parameters: offsets of the geometry.
     """
     holder = next((c for c in machine.components if c.role == "sample_holder"), None)
     if holder is None:
@@ -199,7 +205,16 @@ def sample_bodies(
 
 
 def _shifts(machine: Machine, profile: Profile, p: Offsets) -> dict[str, FloatArray]:
-    """Compute the offset of each anchor from the motors' readings (3,) [mm]."""
+    """Compute the offset of each anchor from the motors' readings (3,) [mm].
+
+    Args:
+        machine: which motors move which anchor.
+        profile: offsets of its motors.
+        p: offsets of the geometry.
+
+    Returns:
+        Anchor -> offset (3,) [mm].
+    """
     tau = from_unity([p.tau_x, 0.0, p.tau_z])
     shifts = {
         "world": np.zeros(3),
@@ -259,6 +274,14 @@ def _chain(
 
     An offset belongs to the motor's reading, so it moves the same parts as the motor; a
     fixed part is at its anchor, and one with a role where the X-ray geometry has it.
+
+    Args:
+        machine: axes and components.
+        part: the component.
+        shifts: anchor -> offset (3,) [mm].
+
+    Returns:
+        Origin (3,) [mm], and slides (axes, 3) and turns (axes,) per unit of each motor.
     """
     chain = machine.chain(part)
     columns = {name: i for i, name in enumerate(machine.axes)}

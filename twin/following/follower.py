@@ -121,7 +121,12 @@ class Follower:
         return self._ended(mirror, heard, waiting, now)
 
     def tick(self, mirror: Mirror, now: float) -> Mirror:
-        """Update the mirror after time without a message: raise alarms for overdue commands."""
+        """Update the mirror after time without a message: raise alarms for overdue commands.
+
+        Args:
+            mirror: present state.
+            now: moment [s].
+        """
         mirror = self._over(mirror, "", now) if mirror.ends is False else mirror
         for waiting in mirror.waiting.values():
             took = now - waiting.sent_s
@@ -213,7 +218,13 @@ class Follower:
 
     def _sent(self, mirror: Mirror, heard: Heard, now: float) -> Mirror:
         """Update the mirror with a command: prediction, place in the script,
-        command under way."""
+        command under way.
+
+        Args:
+            mirror: present state.
+            heard: message with the command.
+            now: moment [s].
+        """
         again = (i for i in mirror.waiting if (i[0], i[2]) == (heard.key, heard.words))
         if any(again) or (heard.named and heard.identity in mirror.ended):
             return mirror
@@ -308,7 +319,13 @@ class Follower:
         return _alarm(mirror, now, "warning", "limit_near", name, what)
 
     def _on_script(self, mirror: Mirror, command: c.Command, now: float) -> Mirror:
-        """Find the command in the script: advance, or raise an alarm."""
+        """Find the command in the script: advance, or raise an alarm.
+
+        Args:
+            mirror: present state.
+            command: that was sent.
+            now: moment [s].
+        """
         if self.script is None:
             return mirror
         bare = _bare(command)
@@ -356,7 +373,14 @@ class Follower:
     # -- replies -----------------------------------------------------------------------------
 
     def _ended(self, mirror: Mirror, heard: Heard, waiting: Waiting | None, now: float) -> Mirror:
-        """Update the mirror with the end of a command: record, range, positions, settings."""
+        """Update the mirror with the end of a command: record, range, positions, settings.
+
+        Args:
+            mirror: present state.
+            heard: message that ends the command.
+            waiting: the command's record; None if its begin was not heard.
+            now: moment [s].
+        """
         command = heard if waiting is None else waiting.heard
         unheard = waiting is None and heard.what == "ACK"
         mirror = replace(mirror.finished(command, unheard), ends=True)
@@ -389,7 +413,14 @@ class Follower:
         return _after(mirror, waiting.heard.command, self.machine, now)
 
     def _arrived(self, mirror: Mirror, waiting: Waiting, heard: Heard, now: float) -> Mirror:
-        """Update positions, limits and rates with the reply at the end of a move."""
+        """Update positions, limits and rates with the reply at the end of a move.
+
+        Args:
+            mirror: present state.
+            waiting: record of the move.
+            heard: reply of its motor.
+            now: moment [s].
+        """
         axis = waiting.heard.words[0]
         motor = motor_reply(reply_bytes(heard.reply))
         at = motor.position if motor is not None else _number(heard.reply)
@@ -415,7 +446,14 @@ class Follower:
         return _alarm(mirror, now, "error", "offset", name, what)
 
     def _compared(self, mirror: Mirror, name: str, motor: MotorReply, now: float) -> Mirror:
-        """Compare limits and rates of a motor's reply with those of the machine file."""
+        """Compare limits and rates of a motor's reply with those of the machine file.
+
+        Args:
+            mirror: present state.
+            name: of the axis.
+            motor: its reply.
+            now: moment [s].
+        """
         axis = self.machine.axes[name]
         for what, theirs, ours in (
             ("limits", (motor.lower, motor.upper), (axis.lower, axis.upper)),
@@ -587,7 +625,14 @@ def _number(text: str) -> float | None:
 
 
 def _after(mirror: Mirror, command: c.Command | None, machine: Machine, now: float) -> Mirror:
-    """Apply the end of a command to the mirror's settings."""
+    """Apply the end of a command to the mirror's settings.
+
+    Args:
+        mirror: present state.
+        command: that has ended.
+        machine: with the time that X-rays need.
+        now: moment [s].
+    """
     match command:
         case c.CameraSetting():
             return replace(mirror, camera=replace(mirror.camera, **command.arguments))

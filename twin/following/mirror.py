@@ -286,7 +286,11 @@ class Mirror:
         return self
 
     def to_dict(self, now: float) -> dict[str, object]:
-        """Return the JSON form at a moment: the public fields, and their ages [s]."""
+        """Return the JSON form at a moment: the public fields, and their ages [s].
+
+        Args:
+            now: moment [s].
+        """
 
         def ago(then: float | None) -> float | None:
             """Return an age to the millisecond."""

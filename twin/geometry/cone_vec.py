@@ -523,6 +523,9 @@ class ConeVec:
     def of_shape(self, shape: Shape2 | None = None) -> Shape2:
         """Return the detector's (rows, cols): those given, or the geometry's own.
 
+        Args:
+            shape: (rows, cols); None: those of the geometry.
+
         Raises:
             GeometryError: neither is known, or they contradict each other.
 
@@ -809,6 +812,9 @@ def _span(values: FloatArray) -> str:
 
 def check_spread(cone_vec: ConeVec) -> ConeVec:
     """Check that each pixel of each view has a ray of its own; returns its argument.
+
+    Args:
+        cone_vec: n views.
 
     Raises:
         GeometryError: names the first row in which u or v is zero, u and v are parallel,

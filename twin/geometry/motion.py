@@ -68,6 +68,10 @@ class Motion:
     def applied(self, poses: Poses, sign: float = 1.0) -> Poses:
         """Add the deviations to axis, angle, source and detector of poses, `sign` times.
 
+        Args:
+            poses: of as many frames.
+            sign: -1 removes the deviations to first order.
+
         Raises:
             TwinError: another number of frames.
         """
@@ -111,6 +115,9 @@ class Motion:
     @classmethod
     def from_dict(cls, document: Mapping[str, Mapping[str, object]]) -> Motion:
         """Make a motion from the document of `to_dict`.
+
+        Args:
+            document: parameter -> its values and standard errors [mm, deg].
 
         Raises:
             TwinError: the document is not of that form; the message names the parameter.

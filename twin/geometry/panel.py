@@ -81,7 +81,11 @@ class PanelModel:
 
     def terms(self, places: FloatArray) -> FloatArray:
         """Compute shifts (..., 2, m) for a coefficient of 1 at places (..., 2),
-        pixels (column, row)."""
+        pixels (column, row).
+
+        Args:
+            places: (..., 2), column and row.
+        """
         rows, cols = self.shape
         middle = np.array([cols - 1, rows - 1]) / 2
         half = max(rows, cols) / 2
@@ -184,6 +188,9 @@ class Panel:
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> Panel:
         """Make a panel from a document.
+
+        Args:
+            document: shape, borders, coefficients and lag.
 
         Raises:
             TwinError: it is not one of `to_json`.

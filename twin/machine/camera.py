@@ -171,6 +171,11 @@ def without_number(mode: str) -> str:
 def check_roi(roi: Roi, grid: PixelGrid, binning: int) -> Roi:
     """Check that `roi` is on the sensor and holds at least one binned pixel; return it.
 
+    Args:
+        roi: region of interest, unbinned pixels.
+        grid: pixels of the sensor.
+        binning: unbinned pixels along each side of an image pixel.
+
     Raises:
         LimitError: names the edge, its value and the allowed ones.
     """

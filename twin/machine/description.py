@@ -887,7 +887,14 @@ def _meshed(own: Raw, corners: Corners | None) -> Raw:
 
 
 def _inherited(own: Raw) -> Raw:
-    """Merge a machine's content into that of its base."""
+    """Merge a machine's content into that of its base.
+
+    Args:
+        own: content of a machine file; `base` and `without` are removed from it.
+
+    Returns:
+        The complete content.
+    """
     name = own.pop("base", None)
     without = own.pop("without", [])
     if name is None and not without:
@@ -910,7 +917,12 @@ def _inherited(own: Raw) -> Raw:
 
 
 def _drop(base: Raw, name: object) -> None:
-    """Remove an axis or a component from a machine's content, and from all that names it."""
+    """Remove an axis or a component from a machine's content, and from all that names it.
+
+    Args:
+        base: content of a machine file; changed in place.
+        name: of the axis or component.
+    """
     parts: list[Raw] = base.get("components", [])
     axes = [base["axes"], base.get("virtual_axes", {})]
     known = [n for table in axes for n in table] + [c["name"] for c in parts]

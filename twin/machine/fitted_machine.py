@@ -46,7 +46,12 @@ def fitted_text(
 
 
 def _replaced(text: str, blocks: Mapping[str, str]) -> str:
-    """Replace tables of `text`; a comment stays unless it is right before one."""
+    """Replace tables of `text`; a comment stays unless it is right before one.
+
+    Args:
+        text: of a machine file.
+        blocks: table's name -> its new text; those that the file lacks are appended.
+    """
     left = dict(blocks)
     out: list[str] = []
     held: list[str] = []

@@ -210,7 +210,16 @@ def _too_far(
     *,
     relative: bool,
 ) -> LimitError:
-    """Convert a motor's limit error to one of the axis that was to move."""
+    """Convert a motor's limit error to one of the axis that was to move.
+
+    Args:
+        machine: with the virtual axis.
+        axis: that was to move.
+        value: its target, or its step [mm, deg].
+        positions: motor -> reading now [mm, deg].
+        error: of one of its motors.
+        relative: `value` is a step.
+    """
     if axis in machine.axes:
         return error
     here = virtual_reading(machine, axis, positions)
@@ -263,7 +272,15 @@ def places(machine: Machine) -> list[Place]:
 
 
 def place(machine: Machine, quantity: str) -> Place:
-    """Describe one quantity by its name in the machine file."""
+    """Describe one quantity by its name in the machine file.
+
+    Args:
+        machine: the machine.
+        quantity: such as object_y.
+
+    Returns:
+        Name, formula, and the values at the ends of travel and at home [mm, deg].
+    """
     fixed = machine.fixed.get(quantity, 0.0) + (
         machine.sample_height_mm if quantity == "object_z" else 0.0
     )

@@ -59,6 +59,9 @@ class Answers:
 def new_machine_text(answers: Answers) -> str:
     """Write a machine file (TOML) from answers.
 
+    Args:
+        answers: name, base, and the values that differ from it.
+
     Raises:
         UnknownNameError: no such base, or it has no such axis.
         LimitError: a range of SOD for a base without a motor along it; SOD or SDD and the
@@ -153,7 +156,12 @@ def new_machine_text(answers: Answers) -> str:
 
 
 def _detector(answers: Answers, base: Machine) -> dict[str, object]:
-    """Collect the values of `[detector]`; None for those that stay."""
+    """Collect the values of `[detector]`; None for those that stay.
+
+    Args:
+        answers: columns, rows, pitch and bits, as far as they are known.
+        base: machine that it begins with.
+    """
     pitch = answers.pitch_mm
     own = base.detector
     out: dict[str, object] = {

@@ -277,7 +277,16 @@ def _state(name: str, drive: Drive, s: float, most: Most) -> _State:
 
 
 def _along(drive: Drive, cells: list[_Cell], now: float) -> Trajectory:
-    """Convert the cells to one motor's trajectory."""
+    """Convert the cells to one motor's trajectory.
+
+    Args:
+        drive: the motor's programme.
+        cells: parts of the braking, in order, with the pace of programme time.
+        now: moment of the stop [s].
+
+    Returns:
+        The trajectory, which ends at rest.
+    """
     pieces: list[Piece] = []
     end = now
     target = drive.at(now).position(now)

@@ -108,6 +108,9 @@ class Trajectory:
         """Return velocity, acceleration, and the time until which the motor obeys them [s].
 
         It also ends where the motor turns round; inf for a motor that rests for good.
+
+        Args:
+            time: moment [s].
         """
         if time >= self.end:
             return 0.0, 0.0, math.inf
@@ -418,7 +421,13 @@ class _Builder:
 
 
 def _first_root(a: float, b: float, c: float) -> float | None:
-    """Solve for the smallest non-negative root of a x^2 + b x + c, or None."""
+    """Solve for the smallest non-negative root of a x^2 + b x + c, or None.
+
+    Args:
+        a: quadratic coefficient.
+        b: linear coefficient.
+        c: constant.
+    """
     if c == 0.0:
         return 0.0
     if a == 0.0:

@@ -191,6 +191,9 @@ class Detector:
     def of_pixels(self, pixels: PixelGrid) -> Detector:
         """Give this detector the pixels of a geometry, each with the charge that its area has.
 
+        Args:
+            pixels: number of columns and rows, and pitch [mm].
+
         Raises:
             LimitError: the detector states another pitch.
 

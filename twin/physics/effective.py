@@ -217,7 +217,8 @@ def _pursue(
     norms = np.linalg.norm(columns, axis=0)
     heavy = np.ones(len(wanted))
     heavy[0] = OPEN_BEAM_WEIGHT
-    chosen, weights = list(chosen), np.zeros(len(chosen))
+    weights = np.zeros(len(chosen))
+    chosen = list(chosen)
     rest = wanted
     while True:
         if chosen:

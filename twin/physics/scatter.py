@@ -329,7 +329,17 @@ def _lit(
     thing: Object, row: FloatArray, shape: tuple[int, int], collimated: bool
 ) -> tuple[float, float, float, float]:
     """Project the object's box on the panel's plane: least column and row,
-    greatest, from its centre."""
+    greatest, from its centre.
+
+    Args:
+        thing: the object with its box [mm].
+        row: cone_vec row (12,).
+        shape: (rows, cols) of the panel.
+        collimated: the beam is limited to the panel.
+
+    Returns:
+        (left, top, right, bottom) [pixels].
+    """
     source = row[0:3]
     centre = row[3:6]
     u = row[6:9]
@@ -490,7 +500,11 @@ def scan_scatter(
 
 def way_of(rows: FloatArray) -> FloatArray:
     """Compute the path length of source and panel up to each view, relative to their
-    distances, (n,) [rad]."""
+    distances, (n,) [rad].
+
+    Args:
+        rows: cone_vec of the views, (n, 12).
+    """
     source = rows[:, 0:3]
     centre = rows[:, 3:6]
     frame = rows[:, 6:12]

@@ -184,7 +184,16 @@ def depth_drawn(number, depth):
 
 @kernel
 def chosen_material(amounts, lower, edge, p, mu, number):
-    """Choose the material that a photon meets at p, by a number in [0, 1)."""
+    """Choose the material that a photon meets at p, by a number in [0, 1).
+
+    Args:
+        amounts: density of each material relative to its own, (z, y, x, m).
+        lower: corner of the grid (3,) [mm].
+        edge: of a voxel (3,) [mm].
+        p: position (3,) [mm].
+        mu: attenuation of the materials (m,) [1/mm].
+        number: random, in [0, 1).
+    """
     nz, ny, nx, materials = amounts.shape
     i = min(max(int((p[0] - lower[0]) / edge[0]), 0), nx - 1)
     j = min(max(int((p[1] - lower[1]) / edge[1]), 0), ny - 1)
@@ -204,7 +213,17 @@ def chosen_material(amounts, lower, edge, p, mu, number):
 def coherent_cosine(state, energy, cumulated, root_step):
     """Draw the angle of a coherent interaction: x^2 from the running integral of
     F^2, then Thomson's (1 + cos^2) / 2 by rejection (Persliden, Comput. Programs
-    Biomed. 17 (1983) 115)."""
+    Biomed. 17 (1983) 115).
+
+    Args:
+        state: of the random numbers.
+        energy: of the photon [keV].
+        cumulated: running integral of F^2.
+        root_step: spacing of its table.
+
+    Returns:
+        The next state of the random numbers, and the cosine.
+    """
     # x = sin(angle / 2) E / hc; the tables are evenly spaced in sqrt(x), finest near 0, where
     # form factors fall. Backward (cosine -1) is x = E / hc, beyond which nothing is drawn.
     greatest = energy / HC_KEV_A
@@ -249,7 +268,13 @@ def incoherent_cosine(state, energy, shell, root_step):
 
 @kernel
 def turn(d, cosine, azimuth):
-    """Turn the unit vector d by a polar angle and an azimuth, in place."""
+    """Turn the unit vector d by a polar angle and an azimuth, in place.
+
+    Args:
+        d: unit vector (3,), changed.
+        cosine: of the polar angle.
+        azimuth: [rad].
+    """
     sine = math.sqrt(max(0.0, 1.0 - cosine * cosine))
     a, b = sine * math.cos(azimuth), sine * math.sin(azimuth)
     x, y, z = d[0], d[1], d[2]

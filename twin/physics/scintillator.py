@@ -51,6 +51,12 @@ class Deposited(NamedTuple):
 def deposited(screen: Filter) -> Deposited:
     """Compute the part of a photon's energy that a layer keeps.
 
+    Args:
+        screen: the layer.
+
+    Returns:
+        Mean and mean square of the kept part, (e,) each, for the energies of the tables.
+
     Example:
         >>> csi = Filter(Substance.of("CsI", "CsI", 4.51), 0.2)
         >>> part = deposited(csi).mean

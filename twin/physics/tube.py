@@ -74,7 +74,11 @@ class TubeModel:
 
     @classmethod
     def of_figures(cls, figures: Mapping[str, float]) -> TubeModel:
-        """Make the tube that `figures` describe; the default tube if they do not."""
+        """Make the tube that `figures` describe; the default tube if they do not.
+
+        Args:
+            figures: name -> number, as `figures` of a data set has them.
+        """
         if "tube_smallest_spot_mm" not in figures:
             return cls()
         layers = {
@@ -141,6 +145,10 @@ def voltages() -> tuple[float, float]:
 
 def tube_spectrum(kV: float, tube: TubeModel | None = None) -> Spectrum:
     """Compute the spectrum that leaves the tube at `kV`, behind its filters.
+
+    Args:
+        kV: voltage.
+        tube: with its filters; None: the default one.
 
     Raises:
         LimitError: the tables do not reach, or nothing comes through the filters.

@@ -196,6 +196,9 @@ class Lookahead:
         2. The new motors halt before the contact, the others carry on.
         3. All halt along the new path, where the new motors are under way already and have
            nothing else that is free.
+
+        Args:
+            new: motor -> requested trajectory.
         """
         contact = self.contact(new)
         if contact is None:
@@ -268,6 +271,11 @@ class Lookahead:
         """Find a late moment before the contact for which `holds`; None if none is found.
 
         Steps back from the contact double until it holds, then bisection.
+
+        Args:
+            holds: the condition on a moment [s].
+            contact: the contact.
+            halvings: number of steps of the bisection.
         """
         late = contact.last_free_time
         back = FIRST_LEAD_S
@@ -308,7 +316,16 @@ class Lookahead:
 
     def _quicker(self, along: Trajectories, most: Most) -> dict[str, Trajectory] | None:
         """Find a quicker stop: along the path for a while, then each motor by
-        itself, if free."""
+        itself, if free.
+
+        Args:
+            along: motor -> trajectory of the stop along the path.
+            most: motor -> greatest acceleration; None: those that the motion was planned
+                with.
+
+        Returns:
+            Motor -> trajectory; None where nothing is quicker and free.
+        """
         whole = max((t.end for t in along.values()), default=self.now) - self.now
         due = [n for n, d in self.drives.items() if d.end > self.now]
         strongest = {
@@ -525,7 +542,13 @@ class StageChange:
     def _refused(
         self, pair: tuple[str, str], seconds: float, last_free: Mapping[str, float]
     ) -> CollisionError:
-        """Make the error for a change that brings parts together."""
+        """Make the error for a change that brings parts together.
+
+        Args:
+            pair: the two parts.
+            seconds: from now to the contact.
+            last_free: motor -> last free position [mm, deg].
+        """
         what = f"sample {self.sample.name!r}" if self.sample.name else "the empty stage"
         if self.correction is not None:
             what += f" with correction {self.correction.name!r}"

@@ -170,6 +170,10 @@ def in_contact(safety: Safety, pair: tuple[str, str] | None) -> Safety:
     """Record that `pair` is in contact, or (None) that nothing is any more.
 
     Parts that have come apart leave the state blocked until a reset. An E-stop stays one.
+
+    Args:
+        safety: present state.
+        pair: two parts, or None.
     """
     if pair is None:
         if safety.contact is None:

@@ -195,7 +195,11 @@ class ScannerTwin:
         return self.corrected(self.poses(now), self.camera, self.correction)
 
     def state(self, now: float) -> ScannerState:
-        """Return everything public, as one frozen value."""
+        """Return everything public, as one frozen value.
+
+        Args:
+            now: twin time [s].
+        """
         axes = {name: self._axis_state(name, now) for name in self.machine.axes}
         for name, virtual in self.machine.virtual_axes.items():
             axes[name] = self._virtual_state(name, axes[virtual.of], now)
@@ -315,6 +319,16 @@ class ScannerTwin:
         A jog that a contact cuts short runs as far as it is free, and returns the
         contact. One that cannot go at all is a blocked attempt and changes nothing: the
         lease that it was to renew runs out.
+
+        Args:
+            axis: motor or virtual axis.
+            velocity: [mm/s, deg/s], of either sign.
+            lease_s: time until it brakes unless renewed [s].
+            now: twin time [s].
+
+        Returns:
+            Time until the motors rest, the contact that it ends before, and where they
+            come to rest.
 
         Raises:
             UnknownNameError, LimitError, SafetyError, CollisionError: as `move`.
@@ -499,6 +513,10 @@ class ScannerTwin:
         What is under way is judged anew where it has changed meanwhile. Motion that is
         not free of the new stage is halted, if halting is free. Moves of the change
         begin.
+
+        Args:
+            change: with its verdict.
+            now: twin time [s].
 
         Returns:
             The contact that halted the motion under way, as an error, or None; it counts
@@ -712,7 +730,12 @@ class ScannerTwin:
         return collision_error(contact, now - zero, self.safety, what, stops)
 
     def _axis_state(self, name: str, now: float) -> AxisReading:
-        """Read a motor."""
+        """Read a motor.
+
+        Args:
+            name: of the motor.
+            now: twin time [s].
+        """
         axis = self.machine.axes[name]
         drive = self._drives[name]
         t = drive.at(now)

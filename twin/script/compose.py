@@ -456,7 +456,11 @@ class _Writer(MotorTargets):
 
 
 def _check_counts(request: _Request) -> None:
-    """Check the counts and distances of a request against their allowed ranges."""
+    """Check the counts and distances of a request against their allowed ranges.
+
+    Args:
+        request: what the script is composed for.
+    """
     smooth = request.kind != "step"
     rules: Sequence[tuple[str, float, float, float]] = (
         ("frames", request.frames, 2 if smooth else 1, MAX_FRAMES),

@@ -108,7 +108,14 @@ def check_plan(
 
 
 def _start_problems(plan: ScanPlan) -> list[ScriptProblem]:
-    """Warn if the first projection is taken with motors that nothing has moved before."""
+    """Warn if the first projection is taken with motors that nothing has moved before.
+
+    Args:
+        plan: of the script, from home or a stated start.
+
+    Returns:
+        At most one warning.
+    """
     seen = [group for group in plan.groups if group.kind == "projection"]
     if not seen:
         return []
@@ -128,7 +135,11 @@ def _start_problems(plan: ScanPlan) -> list[ScriptProblem]:
 
 
 def _optics(view: View) -> Optics:
-    """Describe the images of a view: distances, magnification, field and truncation."""
+    """Describe the images of a view: distances, magnification, field and truncation.
+
+    Args:
+        view: images of one camera setting and kind.
+    """
     p = view.poses
     camera = view.camera
     rows, cols = shape = camera.shape

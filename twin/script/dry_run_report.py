@@ -25,7 +25,11 @@ def html_report(report: CheckReport, name: str = "script") -> str:
 
 
 def against_summary(found: LogComparison) -> Facts:
-    """List the figures of a log comparison as (label, value)."""
+    """List the figures of a log comparison as (label, value).
+
+    Args:
+        found: a log and what was predicted for it.
+    """
     ranges = [row.inside for row in found.rows if row.inside is not None]
     return [
         ("machine", f"{found.machine.name}; timing: {found.machine.timing.source}"),
@@ -42,7 +46,11 @@ def against_summary(found: LogComparison) -> Facts:
 
 
 def summary(report: CheckReport) -> Facts:
-    """List the figures of a report as (label, value)."""
+    """List the figures of a report as (label, value).
+
+    Args:
+        report: of `check_script`.
+    """
     plan = report.plan
     dose = report.dose
     images = sum(len(g.files) for g in plan.groups)
@@ -67,7 +75,11 @@ def summary(report: CheckReport) -> Facts:
 
 
 def _optics_facts(o: Optics) -> Facts:
-    """List the figures of one camera setting as (label, value)."""
+    """List the figures of one camera setting as (label, value).
+
+    Args:
+        o: of one camera setting.
+    """
     where = f"line {o.lines[0]}" if o.lines[0] == o.lines[1] else f"lines {o.lines[0]}-{o.lines[1]}"
     facts = [
         (

@@ -193,6 +193,12 @@ def reply_bytes(text: str) -> bytes:
 def motor_cluster(motor: MotorReply) -> bytes:
     """Encode a motor's reply in the scanner's form; unknown bytes are zero.
 
+    Args:
+        motor: position, target, rates and limits [mm, deg, mm/s, deg/s].
+
+    Returns:
+        The reply's bytes.
+
     Example:
         >>> axis = MotorReply(90.0, 90.0, 45.0, 45.0, -360.0, 360.0, 200.0, 300.0)
         >>> motor_reply(motor_cluster(axis)) == axis, len(motor_cluster(axis))

@@ -286,7 +286,15 @@ def against_log(log: Log, machine: Machine) -> list[LogRow]:
 
 
 def unlike(log: Log, machine: Machine) -> tuple[ScriptProblem, ...]:
-    """Warn of each axis of a log that the machine lacks or that has other limits there."""
+    """Warn of each axis of a log that the machine lacks or that has other limits there.
+
+    Args:
+        log: an executed script.
+        machine: that it is compared with.
+
+    Returns:
+        One warning for each such axis.
+    """
     found: dict[str, ScriptProblem] = {}
     for x in log:
         name = _axis_of(x.command, machine)
@@ -311,7 +319,15 @@ def _plan(log: Log, machine: Machine) -> Simulation:
 
 
 def _replies(logs: Sequence[Log], base: Machine) -> dict[str, tuple[MotorReply, ...]]:
-    """Collect the motors' replies of the logs by axis."""
+    """Collect the motors' replies of the logs by axis.
+
+    Args:
+        logs: executed scripts.
+        base: machine whose names of axes are used.
+
+    Returns:
+        Axis -> its replies, in the order of the logs.
+    """
     found: dict[str, list[MotorReply]] = {}
     for log in logs:
         for x in log:
@@ -368,7 +384,15 @@ def _axis(axis: Axis, replies: Sequence[MotorReply], own: Collection[c.Command])
 
 
 def _samples(logs: Sequence[Log], machine: Machine) -> dict[str, tuple[float, ...]]:
-    """Collect the time beyond motion, pause and exposures [s] by kind of command."""
+    """Collect the time beyond motion, pause and exposures [s] by kind of command.
+
+    Args:
+        logs: executed scripts.
+        machine: with which motion is computed.
+
+    Returns:
+        Kind -> times [s].
+    """
     found: dict[str, list[float]] = {}
     for log in logs:
         moved: set[str] = set()

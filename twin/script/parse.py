@@ -178,7 +178,14 @@ def _columns(text: str) -> tuple[Field, ...]:
 
 
 def _blob_columns(text: str) -> tuple[Field, ...]:
-    """Split a `set sample info` row; its last four columns are found from the right."""
+    """Split a `set sample info` row; its last four columns are found from the right.
+
+    Args:
+        text: the row.
+
+    Returns:
+        Its columns; the argument may contain TABs.
+    """
     pieces = text.split("\t")
     tail = next(
         (k for k in range(len(pieces) - 1, 3, -1) if _BLOB_WAIT.fullmatch("\t" + pieces[k])), None
@@ -232,6 +239,12 @@ def parse_script(text: Source) -> c.Script:
 
 def read_script(text: Source) -> tuple[c.Script, tuple[ScriptProblem, ...]]:
     r"""Read the commands of a script and every problem of its text, in line order.
+
+    Args:
+        text: text or bytes of a script.
+
+    Returns:
+        The script of the lines that could be read, and all problems.
 
     Example:
         >>> script, problems = read_script("camera\tset exposure\tlong\t\tACK\t\t\r\n")
@@ -314,7 +327,7 @@ class _Line:
         self.problems.append(ScriptProblem("warning", code, self.row.line, column, message))
 
     def command(self) -> c.Command | None:
-        """Read the command; None if an error was added."""
+        """Read the command; add an error and return None if it cannot be read."""
         try:
             if not self.component.text:
                 raise _Refused("syntax", 1, "the component (first column) is missing")
@@ -327,7 +340,11 @@ class _Line:
             return None
 
     def _tabbed(self, columns: tuple[Field, ...]) -> _Parts | None:
-        """Divide a row of TAB separated columns; None for an unknown command."""
+        """Divide a row of TAB separated columns; None for an unknown command.
+
+        Args:
+            columns: of the row.
+        """
         verb = columns[1] if len(columns) > 1 else self.end
         spec = grammar.find(self.component.text, verb.text) if verb.text else None
         if spec is None:  # a multi-word command may be split over columns here too
@@ -367,7 +384,15 @@ class _Line:
         return _Parts(spec, first, second, wait, timeout, expected)
 
     def _arguments(self, spec: Spec, body: Sequence[Field]) -> tuple[Field, Field]:
-        """Divide the words between command and wait into two arguments."""
+        """Divide the words between command and wait into two arguments.
+
+        Args:
+            spec: the command, with the number of its arguments.
+            body: the words.
+
+        Returns:
+            The two arguments, empty where the command has fewer.
+        """
         none = Field("", body[0].column if body else len(self.row.text) + 1)
         if not body:
             return none, none
@@ -430,7 +455,11 @@ class _Line:
         return any(_find_wait(_split(f), 0)[1] for f in fields) or bool(_find_wait(fields, 0)[1])
 
     def _build(self, parts: _Parts) -> c.Command | None:
-        """Read arguments, wait and times into a command; None if an error was added."""
+        """Read arguments, wait and times into a command; None if an error was added.
+
+        Args:
+            parts: columns of a known command.
+        """
         before = len(self.problems)
         fields: dict[str, object] = {"line": self.row.line, "column": self.component.column}
         if issubclass(parts.spec.type, c.MotorCommand):
@@ -456,7 +485,11 @@ class _Line:
         return parts.spec.type(**fields)  # type: ignore[arg-type]
 
     def _wait(self, parts: _Parts) -> c.Wait:
-        """Read the wait, or assume it with a warning; check it against the trigger position."""
+        """Read the wait, or assume it with a warning; check it against the trigger position.
+
+        Args:
+            parts: columns of a known command.
+        """
         is_move = parts.spec.type is c.MoveAbsolute
         text = parts.wait.text
         column = parts.wait.column

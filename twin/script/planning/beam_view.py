@@ -77,7 +77,11 @@ def _beyond(low: FloatArray, high: FloatArray, size: int) -> FloatArray:
 
 
 def views(plan: ScanPlan) -> Iterator[View]:
-    """Group the saved images of `plan` by camera setting and kind; sample long sequences."""
+    """Group the saved images of `plan` by camera setting and kind; sample long sequences.
+
+    Args:
+        plan: of a script.
+    """
     batches: dict[tuple[CameraSettings, ImageKind], tuple[list[int], list[int]]] = {}
     first = 0
     for g in plan.groups:
@@ -146,7 +150,15 @@ def _view(
     lines: tuple[int, ...],
     positions: dict[str, FloatArray],
 ) -> View:
-    """Project the sample's outline into the images of one camera setting."""
+    """Project the sample's outline into the images of one camera setting.
+
+    Args:
+        plan: with machine, profile and the sample's size.
+        camera: the setting.
+        kind: of the images.
+        lines: of the script, that take them.
+        positions: axis -> positions (n,) [mm, deg].
+    """
     p = motor_poses(plan.machine, plan.profile, camera, positions)
     shape = camera.shape
     axis = _project(p, p.axis, shape)[:, 0]

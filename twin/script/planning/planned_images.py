@@ -128,7 +128,17 @@ def _length(trigger: planned.Trigger) -> float:
 def _averages(
     trigger: planned.Trigger, exposure_s: float, frames: int | None, length: float
 ) -> tuple[int, str] | None:
-    """Infer averages, and how; None if they are not a whole number within 2 %."""
+    """Infer averages, and how; None if they are not a whole number within 2 %.
+
+    Args:
+        trigger: of the sequence, with its motion.
+        exposure_s: of one read-out [s].
+        frames: number of images, if it is known.
+        length: of the motion [mm, deg].
+
+    Returns:
+        The number of averages, and the figures that it follows from.
+    """
     speed = trigger.speed
     acceleration = trigger.acceleration
     if frames is not None and frames > 1 and length > 0.0:
@@ -193,7 +203,13 @@ class ImageCollector:
         return self._busy(now, length, "take_image_overhead")
 
     def save(self, command: c.SaveImage, now: float, _step: int) -> planned.Span:
-        """Simulate `save image`: name the last image, which determines its kind."""
+        """Simulate `save image`: name the last image, which determines its kind.
+
+        Args:
+            command: with the file's name.
+            now: moment of the script [s].
+            _step: not used.
+        """
         name = image_name(command.path)
         if name is None:
             self.findings.error("path", f"{shorten(command.path)!r} does not end with a file name")
@@ -213,7 +229,13 @@ class ImageCollector:
         return self._busy(now, 0.0, "save_image")
 
     def sequence(self, command: c.TakeSequence, start: float, step: int) -> planned.Span:
-        """Simulate `take and save image sequence`: back to back, during any motion."""
+        """Simulate `take and save image sequence`: back to back, during any motion.
+
+        Args:
+            command: with number of images and file names.
+            start: moment of the first exposure [s].
+            step: index of the command's step.
+        """
         trigger = self._active(start)
         moving = self.motors.moving(start)
         inference = self._infer(trigger, start)
@@ -259,7 +281,17 @@ class ImageCollector:
         exact: Mapping[str, FloatArray] | None = None,
     ) -> ExposureGroup:
         """Add images taken from `start` on with the settings in force; make them
-        the last ones."""
+        the last ones.
+
+        Args:
+            starts: of the exposures, (n,) [s].
+            start: of the command [s].
+            step: index of the command's step.
+            line: of the script.
+            kind: of the images.
+            files: their names; empty until they are saved.
+            exact: axis -> positions (n,), where these are known better than by time.
+        """
         tube = self.tube
         self.moved = self.motors.moving(start)
         lit = tube.lit(start)
@@ -294,7 +326,16 @@ class ImageCollector:
         return None
 
     def _infer(self, trigger: planned.Trigger | None, start: float) -> Inference | None:
-        """Infer frames and averages that the script leaves out; warn of both."""
+        """Infer frames and averages that the script leaves out; warn of both.
+
+        Args:
+            trigger: of the sequence, or None.
+            start: moment of the first exposure [s].
+
+        Returns:
+            Frames and averages that fit the motion; None where none fit, or without a
+            trigger.
+        """
         camera = self.camera
         averages = camera.settings.averages if "averages" in camera.said else None
         frames = camera.settings.frames if "frames" in camera.said else None

@@ -79,7 +79,11 @@ class Simulation:
         return max(self.now, self.motors.end, self.camera.free_at)
 
     def run(self, commands: tuple[c.Command, ...]) -> None:
-        """Simulate all commands in order; add a step for each."""
+        """Simulate all commands in order; add a step for each.
+
+        Args:
+            commands: of the script, in order.
+        """
         axes = (*self.machine.axes, *self.machine.virtual_axes)
         for command in commands:
             if isinstance(command, c.MotorCommand | c.Custom):
@@ -148,7 +152,11 @@ class Simulation:
         return self.timed("command")
 
     def _write_settings(self, _command: c.WriteSettingsFile) -> planned.Span:
-        """Record positions, rates and settings of this moment."""
+        """Record positions, rates and settings of this moment.
+
+        Args:
+            _command: not used; it has no arguments.
+        """
         motors = self.motors.all
         self.settings = Settings(
             self.motors.positions(self.now),
@@ -207,7 +215,11 @@ class Simulation:
     # camera --------------------------------------------------------------------------------
 
     def _stated(self, change: CameraChange) -> planned.Span:
-        """Set a camera setting; report a value that is not allowed and keep the old one."""
+        """Set a camera setting; report a value that is not allowed and keep the old one.
+
+        Args:
+            change: command with the setting.
+        """
         [(name, value)] = change.items()
         now = self.camera.settings
         try:
@@ -238,7 +250,11 @@ class Simulation:
         return False
 
     def _set_rate(self, command: c.SetSpeed | c.SetAcceleration) -> planned.Span:
-        """Set an axis's speed or acceleration, limited to those of its motors."""
+        """Set an axis's speed or acceleration, limited to those of its motors.
+
+        Args:
+            command: with axis and value [mm/s, deg/s, per s].
+        """
         if not self._axis(command):
             return self.timed("command", note=" (no effect)")
         what: Rate = "speed" if isinstance(command, c.SetSpeed) else "acceleration"
@@ -263,7 +279,11 @@ class Simulation:
                 self.findings.error("limit", message)
 
     def _move(self, command: c.MoveAbsolute) -> planned.Span:
-        """Start a move of an axis within its travel; register its trigger."""
+        """Start a move of an axis within its travel; register its trigger.
+
+        Args:
+            command: with axis, target [mm, deg] and wait.
+        """
         if not self._axis(command):
             return self.timed("command", note=" (no effect)")
         name = command.component
