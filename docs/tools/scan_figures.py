@@ -59,8 +59,18 @@ def slices(images: Mapping[str, Image], low: float, high: float, unit: str = "1/
 
 
 def correlation(one: Image, other: Image) -> float:
-    """Return Pearson's correlation of two images."""
-    return float(np.corrcoef(one.ravel(), other.ravel())[0, 1])
+    """Return Pearson's correlation of two images at the shift at which it is greatest.
+
+    A calibration leaves the object's place in its frame open by its sigmas.
+    """
+    spectra = [np.fft.fft2((image - image.mean()) / image.std()) for image in (one, other)]
+    return float(np.fft.ifft2(spectra[0] * spectra[1].conj()).real.max() / one.size)
+
+
+def before_and_after(images: Mapping[str, Image], truth: Image) -> Numbers:
+    """Return the correlations of two images, before and after, with the true one."""
+    names = "correlation_before", "correlation_after"
+    return {name: correlation(one, truth) for name, one in zip(names, images.values(), strict=True)}
 
 
 def scan(angles: int = 120, shape: tuple[int, int] = (96, 120), **changes: Any) -> fx.ConeVec:
@@ -128,14 +138,10 @@ def aligned() -> tuple[Figure, Numbers]:
     grid = fx.Grid((40, 90, 90), 0.6)
     truth = fx.fdk(images, true, grid, errors=False).data
     shown = {
-        name: fx.fdk(images, one.geometry, grid, errors=False).data
+        name: fx.fdk(images, one.geometry, grid, errors=False).data[6]
         for name, one in (("as believed", data), ("aligned", right))
     }
-    numbers = {
-        "correlation_before": correlation(shown["as believed"], truth),
-        "correlation_after": correlation(shown["aligned"], truth),
-    }
-    return slices({name: volume[6] for name, volume in shown.items()}, 0.0, 0.06), numbers
+    return slices(shown, 0.0, 0.06), before_and_after(shown, truth[6])
 
 
 def gap() -> tuple[Figure, Numbers]:
@@ -150,12 +156,14 @@ def gap() -> tuple[Figure, Numbers]:
         dark=seen.dark[:, kept], flat=seen.flat[:, kept],
     )  # fmt: skip
     right = data.with_correction(data.calibrate("lego").correction)
+    whole = fx.DataSet.from_arrays(seen.counts(), wide, dark=seen.dark, flat=seen.flat)
     grid = {"voxel": 0.4, "shape": (6, 90, 90), "errors": False}
     images = {
         "gap unknown": data.reconstruct("fdk", **grid).data[3],
         "gap calibrated": right.reconstruct("fdk", **grid).data[3],
     }
-    return slices(images, 0.0, 0.12), {"gap_px": 2.0}
+    numbers = before_and_after(images, whole.reconstruct("fdk", **grid).data[3])
+    return slices(images, 0.0, 0.12), numbers
 
 
 def motion() -> tuple[Figure, Numbers]:
@@ -163,16 +171,18 @@ def motion() -> tuple[Figure, Numbers]:
     still = scan(angles=90, shape=(190, 239), pixel=0.5984)
     rows = still.rows.copy()
     rows[:, [2, 5]] -= np.linspace(0.0, 1.0, len(rows))[:, None]
-    seen = fx.simulate("lego", fx.ConeVec(rows, still.detector_shape), noise=SEED)
-    data = fx.DataSet.from_arrays(seen.counts(), still, dark=seen.dark, flat=seen.flat)
-    found = data.calibrate("lego", per_frame=["dO_y"])
-    moved = found.datasets[0] if hasattr(found, "datasets") else data
+    rising = fx.ConeVec(rows, still.detector_shape)
+    seen = fx.simulate("lego", rising, noise=SEED)
+    frames = {"dark": seen.dark, "flat": seen.flat}
+    data = fx.DataSet.from_arrays(seen.counts(), still, **frames)
+    (followed,) = data.calibrate("lego", per_frame=["dO_y"]).datasets
     grid = {"voxel": 0.4, "shape": (130, 80, 80), "errors": False}
     images = {
         "taken to stand still": data.reconstruct("fdk", **grid).data[:, 40],
-        "motion of each frame found": moved.reconstruct("fdk", **grid).data[:, 40],
+        "motion of each frame found": followed.reconstruct("fdk", **grid).data[:, 40],
     }
-    return slices(images, 0.0, 0.06), {"rise_mm": 1.0}
+    truth = fx.DataSet.from_arrays(seen.counts(), rising, **frames).reconstruct("fdk", **grid)
+    return slices(images, 0.0, 0.06), before_and_after(images, truth.data[:, 40])
 
 
 def streaks() -> tuple[Figure, Numbers]:

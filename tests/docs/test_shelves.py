@@ -25,7 +25,13 @@ FREE = {"tutorials", "decisions", "reference"}
 INDEXES = {"use.md", "index.md", "coming-from.md"}
 """Pages that lead to others."""
 QUOTED = {
-    "calibration.md": [("calibrated", "miss_before_px", "up to {:.1f} pixels")],
+    "calibration.md": [
+        ("calibrated", "miss_before_px", "up to {:.1f} pixels"),
+        ("tile-gap", "correlation_before", "geometry {:.3f} and"),
+        ("tile-gap", "correlation_after", "and {:.3f} ("),
+        ("motion", "correlation_before", "correlation {:.3f} and"),
+        ("motion", "correlation_after", "and {:.3f} ("),
+    ],
     "align.md": [
         ("aligned", "correlation_before", "{:.3f} before"),
         ("aligned", "correlation_after", "{:.4f} after"),
