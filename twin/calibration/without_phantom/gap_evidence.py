@@ -82,7 +82,8 @@ def find_gap(
         and not _refuted(one, profile, axis)
     ]
     _require_one(rays, values, gap, others)
-    return GapFound(gap, None)
+    inside = profile.at(abs(gap.column - 0.5 - axis))
+    return GapFound(gap._replace(beside_axis=not np.isfinite(inside.sigma)), None)
 
 
 def _certified(gap: Gap, profile: Profile, axis: float, smoothing: float) -> bool:

@@ -47,6 +47,8 @@ MOST_COLUMN: Final = 2.0
 """Largest sigma of the column that is offered [px]."""
 MOST_ROLL: Final = 0.5
 """Largest sigma of the roll that is offered [deg]."""
+HELD_PX: Final = 1e-3
+"""Standard deviation with which the width of a gap beside the axis is held in the fit [px]."""
 FLOOR_DEG: Final = 0.001
 """Added to the roll's sigma: what beam hardening and lag do to the mean (assumed) [deg]."""
 APART_SIGMAS: Final = 4.0
@@ -259,12 +261,12 @@ def _closes(found: Symmetry, gap: Gap) -> bool:
 
 
 def _with_gap(first: FirstColumn, gap: Gap) -> FirstColumn:
-    """Make the width of a gap the last parameter."""
+    """Make the width of a gap the last parameter, held where the plane does not tell it."""
     return replace(
         first,
         values=np.append(first.values, gap.width),
         scales=np.append(first.scales, 1.0),
-        priors=np.append(first.priors, gap.sigma),
+        priors=np.append(first.priors, HELD_PX if gap.beside_axis else gap.sigma),
         preface=f"{gap.text}; ",
     )
 
@@ -309,7 +311,9 @@ def _plane(
     gap, hidden = gap_found
     values, covariance = found.values.copy(), found.covariance.copy()
     if gap is not None and turn is not None:
-        gap = gap._replace(width=float(values[-1]), sigma=float(np.sqrt(covariance[-1, -1])))
+        if not gap.beside_axis:
+            sigma = float(np.sqrt(covariance[-1, -1]))
+            gap = gap._replace(width=float(values[-1]), sigma=sigma)
         values, covariance = values[:OF_TURN], covariance[:OF_TURN, :OF_TURN]
         scales = scales[:OF_TURN]
         scan, turn = _closed(scan, turn, gap)
@@ -322,6 +326,8 @@ def _plane(
     opposite = _opposite_column(scan, first, values, covariance, gap)
     floor = opposite.floor_px if opposite else 0.0
     unseen = hidden.column_px if hidden else 0.0
+    if gap is not None and gap.beside_axis:
+        unseen = gap.sigma / 2
     covariance[0, 0] += (math.hypot(floor, step[0] / 2, beside, unseen) * scales[0]) ** 2
     covariance[1, 1] += math.radians(FLOOR_DEG) ** 2 + (step[0] / scan.shape[0]) ** 2
     slopes = scan.slopes(values, scales)

@@ -45,11 +45,15 @@ EVIDENCE, STANDS_OUT = 24.0, 5.0
 
 
 class Gap(NamedTuple):
-    """Between two tiles: the first column beyond it, and how wide it is, with sigma [px]."""
+    """Between two tiles: the first column beyond it, and how wide it is, with sigma [px].
+
+    Beside the axis a gap moves both ends of all rays alike, so only single frames tell its width.
+    """
 
     column: int
     width: float
     sigma: float
+    beside_axis: bool = False
 
     @property
     def text(self) -> str:
