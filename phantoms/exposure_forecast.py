@@ -510,6 +510,9 @@ class _Ray:
             detail: substance and thickness [mm]; without a substance, a void of that
                 thickness.
             substances: of the ray's paths.
+
+        Raises:
+            LimitError: a void thicker than the path.
         """
         substance, thickness = detail
         if substance is not None:
@@ -530,7 +533,11 @@ class _Ray:
 
 
 def _layer(what: str, words: str) -> tuple[str, float]:
-    """Parse MATERIAL:MM to name and thickness [mm]."""
+    """Parse MATERIAL:MM to name and thickness [mm].
+
+    Raises:
+        LimitError: anything else.
+    """
     name, _, size = words.rpartition(":")
     try:
         value = float(size)

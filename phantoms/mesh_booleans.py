@@ -99,7 +99,11 @@ def _box(one: analytic.Solid | Surface) -> tuple[FloatArray, FloatArray]:
 
 
 def _filled(one: analytic.Solid | Surface) -> Surface:
-    """Convert the piece to a mesh of exactly its form."""
+    """Convert the piece to a mesh of exactly its form.
+
+    Raises:
+        PhantomError: a round solid or a hole.
+    """
     if isinstance(one, Surface):
         return one
     if not isinstance(one.shape, analytic.Box | analytic.ConvexPolyhedron) or one.mu_per_mm < 0.0:

@@ -145,6 +145,9 @@ class Phantom(ArrayValue):
 
         Returns:
             Volume of attenuation [1/mm], data [z, y, x], about the origin.
+
+        Raises:
+            PhantomError: voxels together with other parts.
         """
         if self.voxels is not None:
             if not self.is_voxels:

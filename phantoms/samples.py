@@ -64,11 +64,10 @@ ALLOWED_FORMS: Final = (
 
 @public
 def shepp_logan(size_mm: float = 50.0) -> Phantom:
-    """Make the phantom scaled so that its unit cube [-1, 1] measures `size_mm` [mm]
-    along each side.
+    """Make the Shepp-Logan phantom in a cube, [-1, 1] in its definition.
 
     Args:
-        size_mm: of the cube.
+        size_mm: side of the cube.
 
     Example:
         >>> len(shepp_logan(50.0).scene.solids)
@@ -199,6 +198,9 @@ def _one(
     Args:
         sample, material, voxel_mm, priority: as for `as_phantom`.
         keep: leave meshes at their own places.
+
+    Raises:
+        PhantomError: another kind of value.
     """
     given: Any = sample
     if isinstance(material, Mapping):
@@ -246,6 +248,9 @@ def _named(word: str, material: str | None, keep: bool) -> Phantom:
         word: path of a file, or name.
         material: of a mesh.
         keep: leave a mesh where it is instead of centring it.
+
+    Raises:
+        UnknownNameError: neither a file nor a shipped name.
     """
     path = Path(word)
     kind = path.suffix.lower()
@@ -273,6 +278,9 @@ def _array(
         values: (z, y, x).
         material: of the filled part; None: the values are attenuation [1/mm].
         voxel_mm: spacing, one number or (x, y, z).
+
+    Raises:
+        PhantomError: no spacing, no numbers, or parts outside 0 to 1.
     """
     if voxel_mm is None:
         raise PhantomError(

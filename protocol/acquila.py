@@ -212,7 +212,11 @@ def _attribute(name: str) -> str:
 
 
 def _text(content: Mapping[str, object], name: str) -> str:
-    """Read a text field; a number or a truth value becomes the text that scripts use."""
+    """Read a text field; a number or a truth value becomes the text that scripts use.
+
+    Raises:
+        AcquilaError: any other value.
+    """
     value = content.get(name, "")
     match value:
         case None:
@@ -227,7 +231,11 @@ def _text(content: Mapping[str, object], name: str) -> str:
 
 
 def _plain(name: str, text: str) -> str:
-    """Check a field's length and characters, and return the text unchanged."""
+    """Check a field's length and characters, and return the text unchanged.
+
+    Raises:
+        AcquilaError: too long, or characters that no event can carry.
+    """
     if len(text) > MAX_CHARS[name]:
         raise AcquilaError(f"{name} of {len(text)} characters; allowed: {MAX_CHARS[name]}")
     if (found := (_SURROGATE if name in BINARY_FIELDS else _UNPRINTABLE).search(text)) is not None:

@@ -189,7 +189,11 @@ def _no_extension(code: int, data: bytes) -> object:
 
 
 def _plain(value: object) -> object:
-    """Convert models, arrays, NumPy numbers, sets and mappings to plain Python values."""
+    """Convert models, arrays, NumPy numbers, sets and mappings to plain Python values.
+
+    Raises:
+        TypeError: anything else.
+    """
     match value:
         case BaseModel():
             return value.model_dump(mode="python")

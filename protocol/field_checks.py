@@ -35,7 +35,11 @@ def few(most: int) -> BeforeValidator:
 
 
 def payload(value: object) -> object:
-    """Decode binary data: base64 text, or bytes."""
+    """Decode binary data: base64 text, or bytes.
+
+    Raises:
+        ValueError: anything else.
+    """
     try:
         return bytes(image.payload(value))
     except RpcError as error:

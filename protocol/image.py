@@ -104,7 +104,11 @@ def _wire_dtype(name: str) -> np.dtype[np.generic]:
 
 
 def _shape(value: object) -> tuple[int, ...]:
-    """Check that a shape is a list of up to four sizes."""
+    """Check that a shape is a list of up to four sizes.
+
+    Raises:
+        RpcError: -32602, anything else.
+    """
     if (
         not isinstance(value, (list, tuple))
         or len(value) > 4

@@ -443,7 +443,11 @@ class Correlation(Generic[_W]):
         self.violation = violation
 
     def _settle(self, answer: Response | Failure) -> list[Answered[_W] | Request | Notification]:
-        """Match an answer to its request and close the request."""
+        """Match an answer to its request and close the request.
+
+        Raises:
+            ProtocolError: no such request is open.
+        """
         if answer.id not in self._open_requests:
             raise self._violated(
                 f"an answer to a request that is not open (id {clip(answer.id, 40)})"
@@ -454,7 +458,11 @@ class Correlation(Generic[_W]):
         return [Answered(waiter, answer)]
 
     def _receive_call(self, message: Message) -> list[Answered[_W] | Request | Notification]:
-        """Register a client's call as open."""
+        """Register a client's call as open.
+
+        Raises:
+            ProtocolError: an answer instead of a call.
+        """
         match message:
             case Request(id):
                 self._owed_answers[id] += 1

@@ -221,6 +221,9 @@ def _application(pages: Pages, token: str | None, *, loopback: bool) -> Callable
 
         Args:
             asked: the request as WSGI has it.
+
+        Returns:
+            The page, or an empty one with the status of the error.
         """
         path = asked["PATH_INFO"]
         given = asked.get("HTTP_AUTHORIZATION", "")

@@ -214,7 +214,11 @@ class Workers:
                 self._keep(worker)
 
     def _new(self) -> Worker:
-        """Start a process."""
+        """Start a process.
+
+        Raises:
+            RpcError: no process could be started.
+        """
         try:
             return Worker(self.memory_bytes)
         except OSError as error:  # descriptors, processes or memory have run out

@@ -272,6 +272,9 @@ def _read(source: bytes | str | os.PathLike[str], file_type: str | None) -> tupl
     Args:
         source: path or content.
         file_type: format; None: the path's suffix.
+
+    Raises:
+        PhantomError: not readable, its size, or no format that is read.
     """
     if isinstance(source, bytes):
         raw = source
@@ -297,7 +300,11 @@ def _read(source: bytes | str | os.PathLike[str], file_type: str | None) -> tupl
 
 
 def _check_size(size: int, label: str) -> None:
-    """Check the size of a file [bytes]."""
+    """Check the size of a file [bytes].
+
+    Raises:
+        PhantomError: empty or too large.
+    """
     if not 0 < size <= MAX_BYTES:
         raise PhantomError.instead(f"{label} has {size} bytes", size, f"1 to {MAX_BYTES}")
 
@@ -346,7 +353,11 @@ def _parse(raw: bytes, kind: str) -> trimesh.Trimesh:
 
 def _check_ply(raw: bytes) -> None:
     """Check that the header is there, small, and claims no more elements than
-    there are bytes."""
+    there are bytes.
+
+    Raises:
+        ValueError: names the problem.
+    """
     end = raw.find(b"end_header", 0, MAX_PLY_HEADER)
     if not raw.startswith(b"ply") or end < 0:
         raise ValueError(f"no PLY header within {MAX_PLY_HEADER} bytes")
@@ -363,6 +374,9 @@ def _check_glb(raw: bytes) -> None:
     node in one place.
 
     trimesh allocates the claimed memory, and copies a mesh to each of its places.
+
+    Raises:
+        ValueError: names the problem.
     """
     if len(raw) < 20 or raw[:8] != b"glTF\2\0\0\0" or raw[16:20] != b"JSON":
         raise ValueError("it does not begin as a GLB file (glTF 2.0) does")
@@ -382,6 +396,9 @@ def _check_gltf(document: Any, total: int) -> None:
     Args:
         document: of the file's JSON part.
         total: size of the file [bytes].
+
+    Raises:
+        ValueError: extensions, other files, numbers beyond the size, or too many parts.
     """
     for name in document.get("extensionsRequired", []):
         if not name.startswith(HARMLESS_EXTENSIONS):
@@ -420,7 +437,11 @@ def _check_gltf(document: Any, total: int) -> None:
 
 
 def _check_stl(raw: bytes) -> None:
-    """Compare the length of a binary file with the one that its head announces."""
+    """Compare the length of a binary file with the one that its head announces.
+
+    Raises:
+        ValueError: they differ.
+    """
     if len(raw) < STL_HEAD_BYTES or (raw.lstrip()[:5] == b"solid" and b"facet" in raw[:1024]):
         return
     count = int.from_bytes(raw[STL_HEAD_BYTES - 4 : STL_HEAD_BYTES], "little")
@@ -441,6 +462,9 @@ def _closed(mesh: trimesh.Trimesh, label: str) -> trimesh.Trimesh:
     Args:
         mesh: changed in place.
         label: of the mesh, for messages.
+
+    Raises:
+        PhantomError: it is open.
     """
     import trimesh
 

@@ -103,6 +103,9 @@ def _scene_file(document: Mapping[str, object], folder: Path | None) -> Phantom:
     Args:
         document: of the file.
         folder: where its meshes are; None: none may be named.
+
+    Raises:
+        PhantomError: too many solids, or as its parts.
     """
     given = reading.fields(
         document,
@@ -181,6 +184,9 @@ def _mesh(value: object, where: str, folder: Path | None) -> tuple[Phantom, floa
 
     Returns:
         The mesh's phantom and priority.
+
+    Raises:
+        PhantomError: names the field, its value and the allowed ones.
     """
     given = reading.fields(
         value,
@@ -218,6 +224,9 @@ def _bead_file(document: Mapping[str, object]) -> Phantom:
 
     Args:
         document: of the file.
+
+    Raises:
+        PhantomError: beads and a spiral, a spiral without a body, or beads that overlap.
     """
     given = reading.fields(
         document,
@@ -279,7 +288,11 @@ def _beads(value: object, where: str) -> tuple[tuple[Vector, float, str], ...]:
 
 
 def _spiral(value: object, where: str) -> tuple[int, float, str]:
-    """Read a spiral: number of beads, radius [mm], material."""
+    """Read a spiral: number of beads, radius [mm], material.
+
+    Raises:
+        PhantomError: names the field, its value and the allowed ones.
+    """
     others = {"radius_mm": reading.positive, "material": reading.string}
     given = reading.fields(value, where, {"beads": reading.positive}, others)
     if given["beads"] != int(given["beads"]):

@@ -321,6 +321,10 @@ def _decoded(path: Path, kinds: str) -> npt.NDArray[np.uint16 | np.float32]:
     Args:
         path: of the file.
         kinds: of values that are allowed: u, f.
+
+    Raises:
+        DatasetFormatError: another kind of image, or larger than allowed.
+        ValueError: pixels that cannot be decoded.
     """
     import tifffile
 
@@ -358,7 +362,11 @@ def _decoded(path: Path, kinds: str) -> npt.NDArray[np.uint16 | np.float32]:
 
 
 def _check_inflation(path: Path, raw: BinaryIO, page: Any, size: int) -> None:
-    """Check that every strip inflates to no more than the image's `size` [bytes]."""
+    """Check that every strip inflates to no more than the image's `size` [bytes].
+
+    Raises:
+        DatasetFormatError: a strip inflates to more.
+    """
     raw.seek(0)
     content = raw.read()
     for start, length in zip(page.dataoffsets, page.databytecounts, strict=True):

@@ -391,7 +391,11 @@ class Directory:
 
     @contextmanager
     def _opened(self) -> Iterator[int | None]:
-        """Open the descriptor for a call; None on a system without."""
+        """Open the descriptor for a call; None on a system without.
+
+        Raises:
+            OSError: the folder has been closed.
+        """
         if self._above is not None:
             fd = self._open_below(self._above)
             try:
@@ -420,7 +424,11 @@ class Directory:
 
     def _at(self, name: str) -> str:
         """Check that `name` is one component; return it for a call that takes
-        the descriptor, too."""
+        the descriptor, too.
+
+        Raises:
+            OSError: another kind of name.
+        """
         if name in ("", ".", "..") or "/" in name or "\0" in name:
             raise OSError(errno.EINVAL, "no name of an entry", name)
         if _RELATIVE:

@@ -135,7 +135,11 @@ class ProjectorClient:
         return await self._ask(method, lambda channel: channel.ask(method, params))
 
     async def _ask(self, method: str, work: Callable[[ProjectorLink], Awaitable[_T]]) -> _T:
-        """Do some work on a connection, made if there is none."""
+        """Do some work on a connection, made if there is none.
+
+        Raises:
+            ProjectorUnavailable: no connection, or it was lost.
+        """
         async with self._connecting:
             if self._channel is None or self._channel.lost:
                 self._channel = await self._connect()
@@ -148,7 +152,11 @@ class ProjectorClient:
             ) from None
 
     async def _connect(self) -> ProjectorLink:
-        """Connect and introduce the client; a restarted server has no bodies."""
+        """Connect and introduce the client; a restarted server has no bodies.
+
+        Raises:
+            ProjectorUnavailable: the client is closed, or no projector answers.
+        """
         if self._closed:
             raise ProjectorUnavailable("the projector client is closed")
         try:

@@ -82,7 +82,11 @@ async def volume_put(context: Context, client: JobClient, id: Id, p: wire.Volume
 
 
 async def volume_get(context: Context, client: JobClient, id: Id, p: wire.VolumeRef) -> object:
-    """Send a volume's voxels."""
+    """Send a volume's voxels.
+
+    Raises:
+        RpcError: no such volume, or one without voxels.
+    """
     volume = context.store.get(p.name)
     if not isinstance(volume, Volume):
         raise invalid_params(f"{p.name!r} is a mesh or an analytic scene and has no voxels")
@@ -119,6 +123,9 @@ async def project(context: Context, client: JobClient, id: Id, p: wire.Project) 
     Returns:
         The image value; type, shape and number of parts where the views were sent in
         parts.
+
+    Raises:
+        RpcError: no such volume, or a view that is too large.
     """
     volume = context.store.get(p.volume)
     view = math.prod(p.detector)
@@ -155,6 +162,10 @@ async def backproject(context: Context, client: JobClient, id: Id, p: wire.Backp
     Returns:
         The image value; type, shape and number of parts where it was sent in parts or
         added.
+
+    Raises:
+        RpcError: other numbers of projections and views, another grid than that of the
+            named volume, or no memory.
     """
     if len(p.projections) != len(p.cone_vec):
         raise invalid_params(
@@ -216,7 +227,11 @@ def _document() -> object:
 
 
 def _accumulator(context: Context, name: str | None, grid: wire.VoxelGrid) -> Volume | None:
-    """Return the named volume that a back projection is added to, or None."""
+    """Return the named volume that a back projection is added to, or None.
+
+    Raises:
+        RpcError: it is not a volume of this grid.
+    """
     if name is None or name not in context.store:
         return None
     held = context.store.get(name)
@@ -226,7 +241,11 @@ def _accumulator(context: Context, name: str | None, grid: wire.VoxelGrid) -> Vo
 
 
 def _prepared(volume: Volume | TriangleMesh) -> Volume | TriangleMesh:
-    """Check that a volume is finite, and make its projection layout."""
+    """Check that a volume is finite, and make its projection layout.
+
+    Raises:
+        RpcError: numbers that are not finite.
+    """
     if isinstance(volume, Volume):
         if not np.isfinite(volume.data).all():
             raise invalid_params("the volume holds numbers that are not finite")

@@ -311,6 +311,10 @@ class ProjectorLink:
 
         Returns:
             The result, and the array of its parts, or None.
+
+        Raises:
+            LinkLost: the connection ended.
+            RpcError: the answer is an error.
         """
         pending = _Pending(asyncio.get_running_loop().create_future(), shape)
         request = self._calls.request(method, params, pending, current()[:100])

@@ -89,7 +89,11 @@ def _there(root: Directory, name: str) -> Path:
 
 
 def _text(root: Directory, name: str) -> str:
-    """Read a phantom file of the data directory, which may name no other files."""
+    """Read a phantom file of the data directory, which may name no other files.
+
+    Raises:
+        DatasetMissingError: no such file.
+    """
     if plain_name(name, "phantom") not in root.names():
         raise DatasetMissingError(f"no phantom {name!r} in the data directory", {"asked": name})
     return read_text(root.path / name)

@@ -146,7 +146,12 @@ class DatasetWriter:
         self._files.close()
 
     def _begin(self, resume: bool) -> set[str]:
-        """Check the folder, and return the names of its complete images."""
+        """Check and clean the folder; return the names of its complete images.
+
+        Raises:
+            DatasetExistsError: it has files and the scan is not resumed, or those of
+                another scan.
+        """
         there = self._files.names()
         if there and not resume:
             raise ds.DatasetExistsError(
@@ -175,7 +180,11 @@ class DatasetWriter:
             return False
 
     def _check_same(self) -> None:
-        """Check that the folder holds this scan; take over its start and its correction."""
+        """Check that the folder holds this scan; take over its start and its correction.
+
+        Raises:
+            DatasetExistsError: it cannot be read, or holds another scan.
+        """
         path = self.folder / DOCUMENT
         try:
             found = read_document(self._files)
@@ -202,7 +211,11 @@ class DatasetWriter:
         )
 
     def _check_room(self) -> None:
-        """Check that the missing images fit on the disk."""
+        """Check that the missing images fit on the disk.
+
+        Raises:
+            DiskFullError: they do not.
+        """
         missing = self.missing
         need = sum(2 * self._shapes[f][0] * self._shapes[f][1] for f in missing) + RESERVE_BYTES
         free = free_bytes(self.folder)

@@ -349,7 +349,11 @@ class StateStore:
                 self._put_job(name, job)
 
     def _put_job(self, name: str, job: JobMemory | None) -> None:
-        """Write a job, and remove it from the unwritten ones unless it has changed again."""
+        """Write a job, and remove it from the unwritten ones unless it has changed again.
+
+        Raises:
+            JobsNotWrittenError: the disk does not take it.
+        """
         try:
             self._job_files.write(name, job)
         except DatasetWriteError as error:
@@ -363,7 +367,11 @@ class StateStore:
         document: Memory | None,
         files: Callable[[own.Changes], None] | None,
     ) -> None:
-        """Write files and the document as undoable changes."""
+        """Write files and the document as undoable changes.
+
+        Raises:
+            DatasetWriteError: the disk does not take them, or the server is ending.
+        """
         with self._file:
             if self._ended:
                 raise DatasetWriteError("the server is ending; nothing has changed")

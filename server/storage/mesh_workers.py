@@ -44,7 +44,11 @@ def scene_apart(raw: bytes, *, name: str) -> Phantom:
 
 
 def _apart(read: Callable[..., Phantom], how: dict[str, str], raw: bytes) -> Phantom:
-    """Read bytes in a worker process and return the phantom."""
+    """Read bytes in a worker process and return the phantom.
+
+    Raises:
+        PhantomError: they cannot be read.
+    """
     worker = Worker(MEMORY_BYTES)
     try:
         [text] = worker.ask(document, (read, how), [raw], TIMEOUT_S)

@@ -114,7 +114,11 @@ class PastScans:
 
 
 def work(root: Path, asked: Params, around: TwinContext, codec: Codec) -> list[bytes]:
-    """Answer a request in the worker; return the encoded answer."""
+    """Answer a request in the worker; return the encoded answer.
+
+    Raises:
+        DatasetMissingError: a file that cannot be read.
+    """
     try:
         directory = Directory(root)
         with directory, files.confined(directory):
@@ -200,7 +204,11 @@ class _Scan:
 
 
 def _place(root: Directory, name: str) -> tuple[Path, tuple[object, ...]]:
-    """Find a data set's folder, and a key that changes with its files and its document."""
+    """Find a data set's folder, and a key that changes with its files and its document.
+
+    Raises:
+        DatasetMissingError: no such data set.
+    """
     about = root.stat(plain_name(name, "data set"))
     if about is None or not stat.S_ISDIR(about.st_mode):
         raise ds.DatasetMissingError(f"no data set {name!r} in the data directory", {"asked": name})
@@ -214,6 +222,10 @@ def _scan(folder: files.Folder, most: int) -> _Scan:
     Args:
         folder: of a data set.
         most: largest size of the document [bytes].
+
+    Raises:
+        DatasetError: neither document nor projections, or a document that cannot be read
+            and no projections.
     """
     try:
         if folder.document is None:
@@ -516,7 +528,12 @@ def _same(scan: _Scan, around: TwinContext) -> bool:
 
 
 def _script(folder: files.Folder) -> str:
-    """Read the script of a data set."""
+    """Read the script of a data set.
+
+    Raises:
+        DatasetMissingError: there is none.
+        RpcError: -32008, it is too large.
+    """
     if SCRIPT not in folder.names:
         raise ds.DatasetMissingError(f"{folder.path.name}: no script lies with this data set")
     with files.opened(folder.path / SCRIPT) as file:
@@ -606,6 +623,10 @@ def _frame(
         asked: image, kind and binning.
         around: jobs and machine of the twin.
         codec: of the connection, which limits the size.
+
+    Raises:
+        LimitError: no such image, a binning that leaves nothing, or no line integrals.
+        RpcError: -32008, too large for the connection.
     """
     scan = _opened(root, asked.name)
     folder = scan.folder
@@ -657,7 +678,11 @@ def _frame(
 
 
 def _there(folder: files.Folder, file: str) -> str:
-    """Check that a file exists, and return its name."""
+    """Check that a file exists, and return its name.
+
+    Raises:
+        DatasetMissingError: it does not.
+    """
     if file not in folder.names:
         raise ds.DatasetMissingError(f"{folder.path.name}: {file} is not there", {"path": file})
     return file
@@ -665,7 +690,11 @@ def _there(folder: files.Folder, file: str) -> str:
 
 @lru_cache(4)
 def _normal(scan: _Scan, shape: tuple[int, int]) -> LineIntegrals:
-    """Make the normalisation of a data set from its dark and flat images; cached."""
+    """Make the normalisation of a data set from its dark and flat images; cached.
+
+    Raises:
+        DatasetMissingError: there is no flat image.
+    """
     folder = scan.folder
     dark, flat = (
         folder.paths([f.file for f in scan.images if f.kind == kind]) for kind in ("dark", "flat")

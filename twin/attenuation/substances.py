@@ -248,7 +248,11 @@ def mass_fractions(atoms: Mapping[str, float]) -> dict[str, float]:
 
 
 def _row(symbol: str) -> int:
-    """Return an element's row of the tables."""
+    """Return an element's row of the tables.
+
+    Raises:
+        UnknownNameError: the tables lack the element.
+    """
     elements = tables().elements
     if symbol not in elements:
         what = f"no element {symbol!r} in the attenuation table; it has"

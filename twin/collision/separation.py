@@ -123,7 +123,11 @@ def _improved(
 
 
 def _as_fcl(solid: ConvexSolid) -> tuple[Any, FloatArray]:
-    """Make fcl's shape, and its own centre in the solid's frame (3,) [mm]."""
+    """Make fcl's shape, and its own centre in the solid's frame (3,) [mm].
+
+    Raises:
+        TypeError: neither cylinder nor polytope.
+    """
     import fcl
 
     match solid:

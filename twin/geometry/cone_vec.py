@@ -414,6 +414,9 @@ class ConeVec:
     def concatenate(cls, parts: Sequence[ConeVec]) -> ConeVec:
         """Stack several geometries, in order; the detector's shape is kept if all share it.
 
+        Raises:
+            GeometryError: no geometry.
+
         Example:
             >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
             >>> ConeVec.concatenate([scan[:1], scan[2:]]).shape
@@ -643,6 +646,9 @@ class ConeVec:
             in the
             plane of the source parallel to the detector gives inf or nan: it has no
             projection.
+
+        Raises:
+            GeometryError: points of another shape.
 
         Example:
             >>> cone = ConeVec.from_vectors([0, -500, 0], [0, 500, 0], [0.5, 0, 0], [0, 0, -0.5])

@@ -91,6 +91,9 @@ class Rigid:
             angle_deg: [deg].
             about: a point of the axis, (3,) [mm].
 
+        Raises:
+            GeometryError: an unknown axis.
+
         Example:
             >>> (Rigid.rotate("z", 90, about=(1, 0, 0)) @ [0.0, 0.0, 0.0]).round(9).tolist()
             [1.0, -1.0, 0.0]
@@ -116,7 +119,11 @@ class Rigid:
     @overload
     def __matmul__(self, other: npt.ArrayLike) -> FloatArray: ...
     def __matmul__(self, other: Any) -> Any:
-        """Apply this motion to another one, to a geometry, or to points (..., 3) [mm]."""
+        """Apply this motion to another one, to a geometry, or to points (..., 3) [mm].
+
+        Raises:
+            GeometryError: points of another shape.
+        """
         if isinstance(other, Rigid):
             return Rigid(self.turn @ other.turn, self.turn @ other.shift + self.shift)
         if isinstance(other, ConeVec):

@@ -894,6 +894,9 @@ def _inherited(own: Raw) -> Raw:
 
     Returns:
         The complete content.
+
+    Raises:
+        UnknownNameError: no such base, or a value where the base has a table.
     """
     name = own.pop("base", None)
     without = own.pop("without", [])
@@ -922,6 +925,9 @@ def _drop(base: Raw, name: object) -> None:
     Args:
         base: content of a machine file; changed in place.
         name: of the axis or component.
+
+    Raises:
+        UnknownNameError: the base has no such axis or component.
     """
     parts: list[Raw] = base.get("components", [])
     axes = [base["axes"], base.get("virtual_axes", {})]

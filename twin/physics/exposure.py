@@ -155,7 +155,17 @@ def _noisy(
     rng: np.random.Generator,
     signal: Float32Array,
 ) -> Float32Array:
-    """Add Poisson and read noise of `averages` read-outs to `signal` [counts]."""
+    """Add the noise of a saved image to `signal` in place, and return it.
+
+    Photons are drawn from Poisson's distribution where they are few, else from a normal
+    one, together with the read noise.
+
+    Args:
+        model: photons in a count, and read noise.
+        settings: number of read-outs that are averaged.
+        rng: source of random numbers.
+        signal: expected counts above dark, (n,).
+    """
     photons = np.float32(model.photons_per_count * settings.averages)
     variance = signal / photons
     if settings.xrays_on and signal.min() * photons < MIN_GAUSSIAN_PHOTONS:

@@ -339,6 +339,9 @@ def _lit(
 
     Returns:
         (left, top, right, bottom) [pixels].
+
+    Raises:
+        GeometryError: the source is in the box or beside it.
     """
     source = row[0:3]
     centre = row[3:6]
@@ -429,6 +432,9 @@ class ScanScatter:
             index: of the view.
             values: of the simulated views.
             power: of the weights: 2 for variances.
+
+        Raises:
+            IndexError: no such view.
         """
         if not -len(self) <= index < len(self):
             raise IndexError(f"view {index} of {len(self)}")

@@ -221,7 +221,11 @@ def _to_json(command: Command) -> dict[str, Any]:
 
 
 def _from_json(value: Any) -> Command:
-    """Read a command back from the form of `_to_json`; a Command passes unchanged."""
+    """Read a command back from the form of `_to_json`; a Command passes unchanged.
+
+    Raises:
+        ValueError: an unknown command.
+    """
     if isinstance(value, Command):
         return value
     fields = dict(value)

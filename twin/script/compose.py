@@ -460,6 +460,9 @@ def _check_counts(request: _Request) -> None:
 
     Args:
         request: what the script is composed for.
+
+    Raises:
+        LimitError: names the setting, its value and the allowed ones.
     """
     smooth = request.kind != "step"
     rules: Sequence[tuple[str, float, float, float]] = (

@@ -99,7 +99,11 @@ def number(text: str, what: str, index: int = 0) -> float:
 
 
 def positive(text: str, what: str) -> float:
-    """Read a number of at least `MIN_RATE`, below which no setting of a scanner goes."""
+    """Read a number of at least `MIN_RATE`, below which no setting of a scanner goes.
+
+    Raises:
+        ArgumentError: a lower number, or none.
+    """
     value = number(text, what)
     if value < MIN_RATE:
         raise ArgumentError(f"{what} is {shorten(text)}; it must be at least {MIN_RATE:g}")
@@ -107,7 +111,11 @@ def positive(text: str, what: str) -> float:
 
 
 def not_negative(text: str, what: str) -> float:
-    """Read a number from zero up."""
+    """Read a number from zero up.
+
+    Raises:
+        ArgumentError: a negative number, or none.
+    """
     value = number(text, what)
     if value < 0:
         raise ArgumentError(f"{what} is {shorten(text)}; it must not be negative")
@@ -115,7 +123,11 @@ def not_negative(text: str, what: str) -> float:
 
 
 def whole(text: str, what: str, low: int, high: int, index: int = 0) -> int:
-    """Read a whole number from `low` to `high`; `1440.000000` is one too."""
+    """Read a whole number from `low` to `high`; `1440.000000` is one too.
+
+    Raises:
+        ArgumentError: another number, or none.
+    """
     value = number(text, what, index)
     if not value.is_integer() or not low <= value <= high:
         raise ArgumentError(
@@ -165,14 +177,22 @@ def _text(field: str, what: str) -> Read:
 
 
 def _keep(a: str, _b: str) -> dict[str, object]:
-    """Read TRUE or FALSE."""
+    """Read TRUE or FALSE.
+
+    Raises:
+        ArgumentError: any other word.
+    """
     if a.upper() not in ("TRUE", "FALSE"):
         raise ArgumentError(f"keep xrayon is {shorten(a)!r}; allowed: TRUE, FALSE")
     return {"keep": a.upper() == "TRUE"}
 
 
 def _roi(a: str, _b: str) -> dict[str, object]:
-    """Read the four edges of a ROI."""
+    """Read the four edges of a ROI.
+
+    Raises:
+        ArgumentError: another number of edges, or no region.
+    """
     parts = a.replace(",", " ").replace(";", " ").split()
     if len(parts) != 4:
         raise ArgumentError(

@@ -327,6 +327,9 @@ def _replies(logs: Sequence[Log], base: Machine) -> dict[str, tuple[MotorReply, 
 
     Returns:
         Axis -> its replies, in the order of the logs.
+
+    Raises:
+        MachineFileError: a motor that `base` lacks.
     """
     found: dict[str, list[MotorReply]] = {}
     for log in logs:

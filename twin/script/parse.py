@@ -344,6 +344,9 @@ class _Line:
 
         Args:
             columns: of the row.
+
+        Raises:
+            _Refused: text in a column beyond the seventh.
         """
         verb = columns[1] if len(columns) > 1 else self.end
         spec = grammar.find(self.component.text, verb.text) if verb.text else None
@@ -392,6 +395,9 @@ class _Line:
 
         Returns:
             The two arguments, empty where the command has fewer.
+
+        Raises:
+            _Refused: more words than arguments.
         """
         none = Field("", body[0].column if body else len(self.row.text) + 1)
         if not body:
@@ -415,7 +421,11 @@ class _Line:
         return Field(self.row.text[start - 1 : last.column - 1 + len(last.text)], start)
 
     def _unknown(self) -> c.Command:
-        """Read a row as a custom command with a warning, or refuse it with a suggestion."""
+        """Read a row as a custom command with a warning, or refuse it with a suggestion.
+
+        Raises:
+            _Refused: no command, or one that can be meant for a known component.
+        """
         name = self.component.text
         fields = [f for f in (self.row.columns or self.row.words())[1:] if f.text]
         if name.lower() in grammar.FIXED or grammar.is_reserved(name):
