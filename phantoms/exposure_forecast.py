@@ -196,8 +196,7 @@ def expose(
 
     Returns:
         The forecast. It is as good as the panel's figures, most of which are assumed, and
-        knows no
-        scattered radiation.
+        knows no scattered radiation.
 
     Raises:
         TwinError: names the argument, what was asked and what is allowed.

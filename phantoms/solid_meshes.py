@@ -107,8 +107,12 @@ def _is_hole(solid: analytic.Solid, beads: FloatArray) -> bool:
 
 
 def solid_mesh(solid: analytic.Solid, around: bool = False) -> trimesh.Trimesh:
-    """Make the closed outward mesh of one solid [mm]; a round shape's is inscribed,
-    or encloses it."""
+    """Make the closed outward mesh of one solid [mm].
+
+    Args:
+        solid: the solid.
+        around: the mesh of a round shape encloses it instead of being inscribed.
+    """
     mesh = _mesh(solid.shape)
     if around and isinstance(solid.shape, analytic.Sphere | analytic.Ellipsoid):
         mesh.vertices = solid.shape.center + (mesh.vertices - solid.shape.center) * _ball_around()

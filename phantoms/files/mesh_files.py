@@ -95,8 +95,7 @@ def mesh_phantom(
 
     Returns:
         A solid between planes when the mesh is convex with few of them, else its
-        triangles. Both
-        are projected exactly.
+        triangles. Both are projected exactly.
 
     Raises:
         PhantomError: format, size, unit or content; the message lists the allowed values.
@@ -266,12 +265,14 @@ def voxel_phantom(
 
 
 def _read(source: bytes | str | os.PathLike[str], file_type: str | None) -> tuple[bytes, str, str]:
-    """Read a file, or take bytes; return content, format and label, with size
-    and format checked.
+    """Read a mesh file, or take its bytes; check size and format.
 
     Args:
         source: path or content.
         file_type: format; None: the path's suffix.
+
+    Returns:
+        Content, format in lower case, and label for messages: the file's name, or "mesh".
 
     Raises:
         PhantomError: not readable, its size, or no format that is read.

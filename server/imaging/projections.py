@@ -244,8 +244,7 @@ class Imaging:
 
         Returns:
             The materials (m), float32 (m, n, rows, cols) [mm], and the true geometry (n,
-            12), which
-            must not leave the server.
+            12), which must not leave the server.
 
         Raises:
             ProjectorUnavailable, GeometryError: as `line_integrals`.

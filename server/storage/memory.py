@@ -145,8 +145,7 @@ def restore(memory: Memory, scanner: ScannerTwin, now: float) -> Sample | None:
 
     Returns:
         The sample to put on the stage; None if the state is of another machine or not
-        allowed any
-        more, so that only the E-stop is restored.
+        allowed any more, so that only the E-stop is restored.
     """
     known: p.Scene | None
     known = memory.scene

@@ -100,7 +100,7 @@ class PathSearch:
         return self._motions[k]
 
     def first_contact(self, *, only_contacts: bool = False) -> SweepResult:
-        """Find the first contact, and the least clearance seen on the way (not refined).
+        """Find the first contact, and the least clearance on the way (not refined).
 
         Args:
             only_contacts: skip pairs too distant for a contact, so that clearances are

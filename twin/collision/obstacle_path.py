@@ -51,10 +51,8 @@ def free_moves(
 
     Returns:
         (moves, contact). Moves in order, each motor -> position, the motors of one move
-        together;
-        one move if the direct path is free, None if no free path was found. The contact
-        is that
-        of all motors moving at once, or None.
+        together; one move if the direct path is free, None if no free path was found. The
+        contact is that of all motors moving at once, or None.
     """
     search = _Planner(scene, machine, dict(start), dict(paces or {}))
     goal = {axis: value for axis, value in targets.items() if value != search.at(axis)}

@@ -557,8 +557,7 @@ def refine_pair(
 
     Returns:
         A clearance that occurs, not more than `limits.slack` above the least (`best` if
-        nothing
-        is below that), and the number of evaluations.
+        nothing is below that), and the number of evaluations.
     """
     at: Moment | None = START
     looks = 0

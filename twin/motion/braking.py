@@ -77,8 +77,7 @@ def braked_along(drives: Drives, now: float, most: Most = None) -> dict[str, Tra
 
     Returns:
         Motor -> trajectory, of those that had anything left to do. Positions stray from
-        the path
-        by at most `PATH_TOLERANCE`.
+        the path by at most `PATH_TOLERANCE`.
     """
     due = {name: drive for name, drive in drives.items() if drive.end > now}
     cells = _cells(due, now, most)

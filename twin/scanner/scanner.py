@@ -520,8 +520,7 @@ class ScannerTwin:
 
         Returns:
             The contact that halted the motion under way, as an error, or None; it counts
-            as a blocked
-            attempt.
+            as a blocked attempt.
 
         Raises:
             CollisionError: not even halting is free of the new stage; nothing changes.

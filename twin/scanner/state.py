@@ -234,8 +234,7 @@ def readout(
 
     Returns:
         The readout, or None where there is none: the axis or the detector is not in front
-        of
-        the focal spot.
+        of the focal spot.
     """
     cone = poses[:1].cone_vec(parameters)
     # The axis in the object's frame: through tau, whose direction tau_y does not matter here.

@@ -84,8 +84,7 @@ def read_log(data: bytes) -> tuple[tuple[Executed, ...], tuple[ScriptProblem, ..
 
     Returns:
         Lines in order, and problems: an error for each line that does not hold, a warning
-        for a
-        last line that is cut off and for a motor's reply that is not as expected.
+        for a last line that is cut off and for a motor's reply that is not as expected.
 
     Example:
         >>> (line,), found = read_log(b"tube\txrayoff\t\t\tACK\t\t\t501\t\t09:36:31.952")

@@ -130,8 +130,7 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
                 script.
 
         Returns:
-            `ok` is False with an error or a collision, and
-            `to_dict()` is the JSON.
+            `ok` is False with an error or a collision, and `to_dict()` is the JSON.
         """
         report: CheckReport = backend("scripts").check(self, sample)
         return report
