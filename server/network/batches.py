@@ -60,7 +60,10 @@ class Batch:
         answer: m.Response | m.Failure | None,
         encode: Callable[[m.Response | m.Failure], list[bytes]],
     ) -> None:
-        """Keep the answer to the item that was taken out last; a notification has none."""
+        """Keep the answer to the item that was taken out last; a notification has none.
+
+        An answer that would make the batch too large is replaced by an error.
+        """
         if answer is None:
             return
         body = encode(answer)

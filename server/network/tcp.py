@@ -547,7 +547,7 @@ class _Link(asyncio.BufferedProtocol):
     async def _answer(
         self, message: m.Message | parts.Frozen, refused: RpcError | None = None
     ) -> m.Response | m.Failure | None:
-        """Answer one message, and check that the client may send it.
+        """Answer one message and count it; a violation of the protocol ends the connection.
 
         Args:
             message: decoded, or read in another process.

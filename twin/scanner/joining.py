@@ -522,9 +522,9 @@ class StageChange:
     def _require_no_nearer(self, changed: Lookahead) -> None:
         """Check that pairs within the margin stay above their floor on the new stage.
 
-        A sample on a stage of the turntable counts wherever that can bring it, so pairs
-        that are near already are measured where they stand as well: else the reach of one
-        sample would excuse another that really overlaps.
+        A sample on a stage of the turntable is as large as the region that the stage can
+        bring it to. Pairs that are near already are therefore measured at their present
+        positions as well: else that region would excuse a sample that really overlaps.
 
         Raises:
             CollisionError: a pair is nearer than its floor.
