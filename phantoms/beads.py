@@ -65,8 +65,8 @@ def spiral_positions(size_mm: Sequence[float], beads: int, radius_mm: float) -> 
     if not 1 <= beads <= MAX_BEADS:
         raise LimitError.instead(f"{beads} beads asked", beads, f"1 to {MAX_BEADS}")
     if not 0.0 < min(width, breadth, height) <= max(width, breadth, height) < math.inf:
-        said = f"a cuboid of {width:g} x {breadth:g} x {height:g} mm cannot be"
-        raise LimitError.instead(said, [width, breadth, height], "sides of more than 0 mm")
+        message = f"a cuboid of {width:g} x {breadth:g} x {height:g} mm cannot be"
+        raise LimitError.instead(message, [width, breadth, height], "sides of more than 0 mm")
     if not 0.0 < 2.0 * radius_mm <= min(width, breadth, height):
         raise LimitError(
             f"a bead of radius {radius_mm:g} mm does not fit into {width:g} x {breadth:g} x "
@@ -269,11 +269,11 @@ def _check_inside(centers: FloatArray, radii: FloatArray, size_mm: Vector) -> No
         i, axis = (int(v) for v in np.argwhere(room < -1e-9)[0])
         place = centers[i].tolist()
         along = "xyz"[axis]
-        most = float(size_mm[axis] / 2 - radii[i])
+        limit = float(size_mm[axis] / 2 - radii[i])
         raise LimitError(
             f"bead {i} at {place} mm with radius {radii[i]:g} mm sticks out of the body along "
-            f"{along}: |{along}| may be at most {most:g} mm",
-            {"bead": i, "asked": place, "allowed": most},
+            f"{along}: |{along}| may be at most {limit:g} mm",
+            {"bead": i, "asked": place, "allowed": limit},
         )
 
 

@@ -94,10 +94,10 @@ def channels(phantom: Phantom) -> tuple[Channel, ...]:
         made_of = material(surface.material)
         out.append(Channel(made_of, _mesh(phantom, surface, made_of), longest))
     if phantom.voxels is not None and phantom.voxels.labels is not None:
-        whole = as_volume(phantom.voxels)
+        volume = as_volume(phantom.voxels)
         for label, name in enumerate(phantom.voxels.materials, 1):
-            there = whole.like((phantom.voxels.labels == label).astype(np.float32))
-            out.append(Channel(material(name), there, longest))
+            part = volume.like((phantom.voxels.labels == label).astype(np.float32))
+            out.append(Channel(material(name), part, longest))
     elif phantom.voxels is not None:
         made_of = material(phantom.voxels.material or STAND_IN)
         density = _scaled(as_volume(phantom.voxels), made_of)
@@ -216,20 +216,20 @@ def _amounts(solid: Solid, known: dict[str, Material]) -> list[tuple[str, float]
     Returns:
         One entry, or two where the solid replaces one material by another.
     """
-    own = known.get(solid.material)
-    if own is None:
+    made_of = known.get(solid.material)
+    if made_of is None:
         return [(STAND_IN, solid.mu_per_mm / materials()[STAND_IN].mu_per_mm)]
-    amount = solid.mu_per_mm / own.mu_per_mm
+    amount = solid.mu_per_mm / made_of.mu_per_mm
     if abs(abs(amount) - 1.0) <= ATTENUATION_TOLERANCE:
-        return [(own.name, round(amount))]
+        return [(made_of.name, round(amount))]
     for other in known.values():
-        difference = own.mu_per_mm - other.mu_per_mm
+        difference = made_of.mu_per_mm - other.mu_per_mm
         if (
-            other is not own
-            and abs(solid.mu_per_mm - difference) <= ATTENUATION_TOLERANCE * own.mu_per_mm
+            other is not made_of
+            and abs(solid.mu_per_mm - difference) <= ATTENUATION_TOLERANCE * made_of.mu_per_mm
         ):
-            return [(own.name, 1.0), (other.name, -1.0)]
-    return [(own.name, amount)]
+            return [(made_of.name, 1.0), (other.name, -1.0)]
+    return [(made_of.name, amount)]
 
 
 def _scaled(volume: Volume, made_of: Material) -> Volume:

@@ -92,8 +92,8 @@ def fields(
     readers = {**needed, **others}
     for key in mapping(value, where):
         if key not in readers:
-            said = f"{where}: unknown key {key!r}"
-            raise PhantomError.instead(said, key, list(readers), path=f"{where}.{key}")
+            message = f"{where}: unknown key {key!r}"
+            raise PhantomError.instead(message, key, list(readers), path=f"{where}.{key}")
     given = {name: get(value, name, where) for name in needed} | dict(mapping(value, where))
     return {name: readers[name](one, f"{where}.{name}") for name, one in given.items()}
 

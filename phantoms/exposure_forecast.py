@@ -326,7 +326,7 @@ def _check_settings(
             f"{high:g}, or None",
             {"asked": [], "allowed": [low, high]},
         )
-    for what, values, least, most in (
+    for what, values, low_end, high_end in (
         ("kV", kVs, low, high),
         ("power_W", [power_W], 1e-9, machine.tube.max_W),
         ("exposure_ms", [exposure_ms], spec.min_exposure_ms, spec.max_exposure_ms),
@@ -335,12 +335,12 @@ def _check_settings(
     ):
         for value in values:
             counted = what in ("averages", "images")
-            if not least <= value <= most or (counted and value != int(value)):
-                whole = "whole numbers from " if counted else ""
+            if not low_end <= value <= high_end or (counted and value != int(value)):
+                integers = "whole numbers from " if counted else ""
                 raise LimitError(
-                    f"{what} is {value:g}; allowed with {machine.name}: {whole}{least:g} to "
-                    f"{most:g}",
-                    {"asked": value, "allowed": [least, most]},
+                    f"{what} is {value:g}; allowed with {machine.name}: {integers}{low_end:g} to "
+                    f"{high_end:g}",
+                    {"asked": value, "allowed": [low_end, high_end]},
                 )
 
 

@@ -41,10 +41,10 @@ def united(mesh: TriangleMesh) -> TriangleMesh | None:
     if not _boxes_meet([mesh.vertices[np.unique(mesh.faces[body])] for body in bodies]):
         return mesh
     try:
-        made = _solid(mesh, bodies).to_mesh64()
+        mesh64 = _solid(mesh, bodies).to_mesh64()
     except PhantomError:
         return None
-    return TriangleMesh(made.vert_properties[:, :3], made.tri_verts.astype(np.int64))
+    return TriangleMesh(mesh64.vert_properties[:, :3], mesh64.tri_verts.astype(np.int64))
 
 
 def cut(
@@ -133,9 +133,9 @@ def _outside(surface: Surface, others: Sequence[Surface]) -> Surface | None:
     left = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Subtract)
     if left.is_empty():
         return None
-    made = left.to_mesh64()
+    mesh64 = left.to_mesh64()
     return replace(
-        surface, vertices=made.vert_properties[:, :3], faces=made.tri_verts.astype(np.int32)
+        surface, vertices=mesh64.vert_properties[:, :3], faces=mesh64.tri_verts.astype(np.int32)
     )
 
 

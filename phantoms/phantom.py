@@ -177,10 +177,10 @@ class Phantom(ArrayValue):
         if "surface" in doc:  # one: as 0.2.0 wrote it
             doc["surfaces"] = [doc["surface"]]
         try:
-            made: Phantom = adapter_of(Phantom).validate_python(doc)
+            phantom: Phantom = adapter_of(Phantom).validate_python(doc)
         except ValidationError as error:
             raise PhantomError(*told("phantom", error)) from None
-        return made
+        return phantom
 
 
 def assemble(

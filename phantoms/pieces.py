@@ -71,9 +71,9 @@ class Voxels(ArrayValue):
     def __post_init__(self) -> None:
         data = np.array(self.data, dtype=np.float32)
         if data.ndim != 3 or data.size == 0:
-            said = f"voxels have shape {data.shape}"
+            message = f"voxels have shape {data.shape}"
             shape = list(data.shape)
-            raise PhantomError.instead(said, shape, "(z, y, x), none of them 0")
+            raise PhantomError.instead(message, shape, "(z, y, x), none of them 0")
         if not np.isfinite(data).all():
             raise PhantomError("voxels hold values that are not finite")
         freeze(self, data=data)

@@ -181,9 +181,9 @@ def as_phantom(
         ...            ).size_mm
         (10.0, 10.0, 10.0)
     """
-    made = _one(sample, material, voxel_mm, keep=False, priority=priority)
-    files.require_replaced(made, sample)
-    return made
+    phantom = _one(sample, material, voxel_mm, keep=False, priority=priority)
+    files.require_replaced(phantom, sample)
+    return phantom
 
 
 def _one(
@@ -237,8 +237,8 @@ def _one(
 def _require_none(material: str | None, what: str) -> None:
     """Raise PhantomError if `material` is given for `what`, which has its own."""
     if material is not None:
-        said = f"{what} has its own materials; material is for a mesh or an array"
-        raise PhantomError(said, {"asked": material, "allowed": None})
+        message = f"{what} has its own materials; material is for a mesh or an array"
+        raise PhantomError(message, {"asked": material, "allowed": None})
 
 
 def _named(word: str, material: str | None, keep: bool) -> Phantom:
@@ -326,9 +326,9 @@ def _labelled(sample: object, names: Mapping[int, str], voxel_mm: float | Vector
     index = np.zeros(labels.shape, np.uint8)
     known = labels == 0
     for i, key in enumerate(order[1:256], 1):
-        there = labels == key
-        index[there] = i
-        known |= there
+        labelled = labels == key
+        index[labelled] = i
+        known |= labelled
     unknown = np.unique(labels[~known]).tolist()
     if unknown or 0 in names or len(order) > 256:
         raise PhantomError(
@@ -338,12 +338,12 @@ def _labelled(sample: object, names: Mapping[int, str], voxel_mm: float | Vector
         )
     mu = np.array([0.0, *(material_of(names[key]).mu_per_mm for key in order[1:])], np.float32)
     if isinstance(sample, Volume):
-        made = voxel_phantom(mu[index], sample.voxel_xyz, center_mm=sample.center_mm)
+        phantom = voxel_phantom(mu[index], sample.voxel_xyz, center_mm=sample.center_mm)
     else:
-        made = _array(mu[index], None, voxel_mm)
-    assert made.voxels is not None
+        phantom = _array(mu[index], None, voxel_mm)
+    assert phantom.voxels is not None
     kinds = tuple(names[key] for key in order[1:])
-    return replace(made, voxels=replace(made.voxels, labels=index, materials=kinds))
+    return replace(phantom, voxels=replace(phantom.voxels, labels=index, materials=kinds))
 
 
 def _mesh(mesh: Any, material: str | None, keep: bool) -> Phantom:

@@ -53,8 +53,8 @@ def voxelise(
     counts = [max(math.ceil(s / voxel_mm - 1e-9), 1) for s in size_mm]
     if math.prod(counts) > MAX_VOXELS:
         grid = " x ".join(map(str, counts))
-        said = f"{grid} voxels of {voxel_mm:g} mm are too many"
-        raise PhantomError.instead(said, math.prod(counts), MAX_VOXELS)
+        message = f"{grid} voxels of {voxel_mm:g} mm are too many"
+        raise PhantomError.instead(message, math.prod(counts), MAX_VOXELS)
     data = np.zeros(counts[::-1], dtype=np.float32)
     for solid in scene.solids:
         _add_solid(data, solid.shape, solid.mu_per_mm, voxel_mm, oversample)

@@ -216,11 +216,11 @@ class Connection:
         at = 0
         begun += memoryview(data)[skipped:]
         held: bytes | bytearray = begun
-        while (there := len(held)) - at >= 4:
+        while (available := len(held)) - at >= 4:
             (size,) = _size(held, at)
             end = at + 4 + size
             if size <= self.max_message:
-                if end > there:
+                if end > available:
                     break
                 if held is begun:  # once, because bytes are cut faster
                     held = bytes(begun)
@@ -228,11 +228,11 @@ class Connection:
                 self._held += size
             elif size <= MAX_FRAME:
                 self._new.append(Malformed(too_large("a frame", size, self.max_message)))
-                self._skip = max(0, end - there)
+                self._skip = max(0, end - available)
             else:
                 self._refuse(too_large("a frame", size, MAX_FRAME), fatal=True)
                 return
-            at = min(end, there)
+            at = min(end, available)
         del begun[:at]
 
     def _refuse(self, error: RpcError, *, fatal: bool = False) -> None:

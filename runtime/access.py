@@ -135,8 +135,8 @@ def with_limits(words: Sequence[str], default: _L, others: Collection[str] = ())
             value = math.nan
         if not 0.0 < value < math.inf:
             raise AccessError(f"--limit {word!r}: {name} must be a number above 0")
-        whole = isinstance(getattr(out, name), int) or name == "disk_quota"
-        changed: dict[str, Any] = {name: int(value) if whole else value}
+        is_integer = isinstance(getattr(out, name), int) or name == "disk_quota"
+        changed: dict[str, Any] = {name: int(value) if is_integer else value}
         out = replace(out, **changed)
     return out
 

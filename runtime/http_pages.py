@@ -233,22 +233,22 @@ def _application(pages: Pages, token: str | None, *, loopback: bool) -> Callable
             return HttpResponse("{}", HTTPStatus.METHOD_NOT_ALLOWED)
         if path not in pages:
             return HttpResponse("{}", HTTPStatus.NOT_FOUND)
-        said = given.removeprefix("Bearer ")
-        if token is not None and path not in OPEN_PAGES and not token_matches(said, token):
+        bearer = given.removeprefix("Bearer ")
+        if token is not None and path not in OPEN_PAGES and not token_matches(bearer, token):
             return HttpResponse("{}", HTTPStatus.UNAUTHORIZED)
         asked[ADMIT]()
-        made: Future[HttpResponse] = Future()
+        page: Future[HttpResponse] = Future()
 
         def make() -> None:
             """Make the page in a turn of the loop."""
             try:
-                made.set_result(pages[path]())
+                page.set_result(pages[path]())
             except Exception as error:
-                made.set_exception(error)
+                page.set_exception(error)
 
         try:
             loop.call_soon_threadsafe(make)
-            return made.result(MAX_HELD_S)
+            return page.result(MAX_HELD_S)
         except (TimeoutError, RuntimeError):  # the loop is held, or closed
             return HttpResponse("{}", HTTPStatus.SERVICE_UNAVAILABLE)
 

@@ -114,8 +114,8 @@ def scatter_method(text: str) -> str:
         typer.BadParameter: another one.
     """
     if text not in get_args(Scatter):
-        gone = "; 'first' has been removed, use 'mc'" if text == "first" else ""
-        raise typer.BadParameter(f"{text!r} is not one of {', '.join(get_args(Scatter))}{gone}")
+        removed = "; 'first' has been removed, use 'mc'" if text == "first" else ""
+        raise typer.BadParameter(f"{text!r} is not one of {', '.join(get_args(Scatter))}{removed}")
     return text
 
 

@@ -113,8 +113,8 @@ class Worker:
             case b"refused":
                 raise RpcError(*json.loads(answer[0]))
             case b"memory":
-                most = self._memory >> 20
-                raise too_large(_label(work), f"more than {most}", most, "MiB of memory")
+                limit_mib = self._memory >> 20
+                raise too_large(_label(work), f"more than {limit_mib}", limit_mib, "MiB of memory")
         raise RuntimeError(answer[0].decode("utf-8", "replace"))
 
     def _wait(self, seconds: float) -> None:

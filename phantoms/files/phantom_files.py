@@ -126,11 +126,11 @@ def _scene_file(document: Mapping[str, object], folder: Path | None) -> Phantom:
     scene = Scene(tuple(solid for several in listed for solid in several))
     parts = [] if not listed else [(Phantom(name, "", scene, size_about_origin(scene)), 0.0)]
     parts += given.get("mesh", ())
-    told = given.get("description", "")
+    description = given.get("description", "")
     ranks = [rank for _, rank in parts]
-    whole = assemble(name, [part for part, _ in parts], told, ranks)
-    require_replaced(whole, document.get("solid", []))
-    return whole
+    phantom = assemble(name, [part for part, _ in parts], description, ranks)
+    require_replaced(phantom, document.get("solid", []))
+    return phantom
 
 
 def require_replaced(phantom: Phantom, solids: object) -> None:
@@ -146,12 +146,12 @@ def require_replaced(phantom: Phantom, solids: object) -> None:
     from flexdt.phantoms.voxelise import voxelise
 
     listed = solids if isinstance(solids, list | tuple) else [solids]
-    told = [one["replaces"] for one in listed if isinstance(one, Mapping) and "replaces" in one]
-    for name in dict.fromkeys(told):
-        there = tuple(one for one in phantom.scene.solids if one.material == name)
+    replaced = [one["replaces"] for one in listed if isinstance(one, Mapping) and "replaces" in one]
+    for name in dict.fromkeys(replaced):
+        present = tuple(one for one in phantom.scene.solids if one.material == name)
         meshes = [one for one in phantom.surfaces if one.material == name]
         edge = max(phantom.size_mm) / CHECKED_VOXELS_ALONG
-        least = float(voxelise(Scene(there), meshes, phantom.size_mm, edge, 2).data.min())
+        least = float(voxelise(Scene(present), meshes, phantom.size_mm, edge, 2).data.min())
         if least < -MAX_ABSENT_SHARE * material_of(name).mu_per_mm:
             raise PhantomError(
                 f"{name} is replaced where there is none of it, or twice; allowed: inside solids "
@@ -167,11 +167,11 @@ def solids_of(value: object, where: str) -> tuple[Solid, ...]:
     instead = fields.pop("replaces", None)
     del fields["material"]
     shape = shape_from_dict(fields, where)
-    own = Solid(shape, made_of.name, made_of.mu_per_mm)
+    filled = Solid(shape, made_of.name, made_of.mu_per_mm)
     if instead is None:
-        return (own,)
-    gone = material_of(reading.string(instead, f"{where}.replaces"))
-    return (Solid(shape, gone.name, -gone.mu_per_mm), own)
+        return (filled,)
+    replaced = material_of(reading.string(instead, f"{where}.replaces"))
+    return (Solid(shape, replaced.name, -replaced.mu_per_mm), filled)
 
 
 def _mesh(value: object, where: str, folder: Path | None) -> tuple[Phantom, float]:
@@ -258,7 +258,7 @@ def _bead_file(document: Mapping[str, object]) -> Phantom:
         )
     if size is None:
         size = tuple((2.0 * np.max(np.abs(centers) + radii[:, None], axis=0)).tolist())
-    told = given.get("description", f"{len(centers)} beads in {body or 'air'}")
+    description = given.get("description", f"{len(centers)} beads in {body or 'air'}")
     return cuboid_with_beads(
         given["name"],
         size,
@@ -266,7 +266,7 @@ def _bead_file(document: Mapping[str, object]) -> Phantom:
         radii,
         body_material=body,
         bead_materials=metals,
-        description=told,
+        description=description,
     )
 
 
@@ -318,12 +318,12 @@ def sent_scene(text: bytes, *, name: str) -> Phantom:
     phantom = load_phantom_file(document, name)
     solids = phantom.scene.solids
     faces = sum(len(one.faces) for one in phantom.surfaces)
-    for what, count, most in (
+    for what, count, allowed in (
         ("solids", len(solids), MAX_SENT_SOLIDS),
         ("triangles", faces, MAX_FACES),
     ):
-        if count > most:
-            raise PhantomError.instead(f"{name} has {count} {what}", count, most)
+        if count > allowed:
+            raise PhantomError.instead(f"{name} has {count} {what}", count, allowed)
     if phantom.voxels is not None and not phantom.is_voxels:
         raise PhantomError(f"{name}: voxels cannot be put together with other parts")
     for surface in phantom.surfaces:
@@ -336,6 +336,6 @@ def sent_scene(text: bytes, *, name: str) -> Phantom:
         own = size_about_origin(phantom.scene, phantom.surfaces)
         size = (max(size[0], own[0]), max(size[1], own[1]), max(size[2], own[2]))
     if max(size) > MAX_EXTENT_MM:
-        said = f"{name} measures {max(size):g} mm about its axis"
-        raise PhantomError.instead(said, max(size), f"{MAX_EXTENT_MM:g} mm")
+        message = f"{name} measures {max(size):g} mm about its axis"
+        raise PhantomError.instead(message, max(size), f"{MAX_EXTENT_MM:g} mm")
     return replace(phantom, name=name, size_mm=size)

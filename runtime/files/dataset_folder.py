@@ -218,8 +218,8 @@ def list_folder(path: Path) -> Folder:
             links = within is None
             names = frozenset(e.name for e in entries if e.is_file(follow_symlinks=links))
     except OSError as error:
-        said = f"cannot read folder {path}: {error.strerror}"
-        raise ds.DatasetMissingError(said, {"path": str(path)}) from None
+        message = f"cannot read folder {path}: {error.strerror}"
+        raise ds.DatasetMissingError(message, {"path": str(path)}) from None
     return Folder(path, names)
 
 
@@ -237,12 +237,12 @@ def read_text(path: Path, most: int = MAX_TEXT_BYTES) -> str:
         with opened(path) as file:
             size = os.fstat(file.fileno()).st_size
             if size > most:
-                said = f"{path} has {size} bytes"
-                raise ds.DatasetFormatError.instead(said, size, most, path=str(path))
+                message = f"{path} has {size} bytes"
+                raise ds.DatasetFormatError.instead(message, size, most, path=str(path))
             raw = file.read()
     except OSError as error:
-        said = f"cannot read {path}: {error.strerror}"
-        raise ds.DatasetFormatError(said, {"path": str(path)}) from None
+        message = f"cannot read {path}: {error.strerror}"
+        raise ds.DatasetFormatError(message, {"path": str(path)}) from None
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -301,8 +301,8 @@ def read_values(
     except OSError as error:
         raise ds.DatasetFormatError(f"cannot read {path}: {error}", {"path": str(path)}) from None
     except Exception as error:  # A third party's parser on a damaged file: anything may come.
-        said = f"{path} is not a readable TIFF image: {error}"
-        raise ds.DatasetFormatError(said, {"path": str(path)}) from None
+        message = f"{path} is not a readable TIFF image: {error}"
+        raise ds.DatasetFormatError(message, {"path": str(path)}) from None
     if shape is not None and image.shape != shape:
         raise ds.DatasetFormatError(
             f"{path} has {image.shape[1]} x {image.shape[0]} pixels, the data set has {shape[1]} "
@@ -343,9 +343,9 @@ def _decoded(path: Path, kinds: str) -> npt.NDArray[np.uint16 | np.float32]:
             )
         size = kind.itemsize * math.prod(shape)
         if size > MAX_IMAGE_BYTES:
-            said = f"{path} claims {shape[1]} x {shape[0]} pixels"
+            message = f"{path} claims {shape[1]} x {shape[0]} pixels"
             most = f"{MAX_IMAGE_BYTES} bytes"
-            raise ds.DatasetFormatError.instead(said, size, most, path=str(path))
+            raise ds.DatasetFormatError.instead(message, size, most, path=str(path))
         wanted = np.uint16 if kind.kind == "u" else np.float32
         packing = tifffile.COMPRESSION
         if page.compression in (packing.ADOBE_DEFLATE, packing.DEFLATE):
@@ -382,10 +382,10 @@ def blank_images(folder: Folder, names: Sequence[str]) -> tuple[str, ...]:
 
     A stopped scan leaves such images if the files were made in advance.
     """
-    there = [name for name in names if name in folder.names]
-    if not there or not _blank(folder.path / there[-1]):
+    present = [name for name in names if name in folder.names]
+    if not present or not _blank(folder.path / present[-1]):
         return ()
-    return tuple(name for name in there if _blank(folder.path / name))
+    return tuple(name for name in present if _blank(folder.path / name))
 
 
 def _blank(path: Path) -> bool:
@@ -446,9 +446,9 @@ def tiff_bytes(image: npt.NDArray[np.uint16]) -> bytes:
         (305, text, 7, at),
     )
     entries = b"".join(struct.pack("<HHII", *tag) for tag in tags)
-    beside = software + struct.pack("<II", 1, 1)
-    head = struct.pack("<2sHI", b"II", 42, at + len(beside))
-    return b"".join((head, pixels, beside, struct.pack("<H", len(tags)), entries, bytes(4)))
+    trailer = software + struct.pack("<II", 1, 1)
+    head = struct.pack("<2sHI", b"II", 42, at + len(trailer))
+    return b"".join((head, pixels, trailer, struct.pack("<H", len(tags)), entries, bytes(4)))
 
 
 def free_name(root: Directory, wish: str) -> str:

@@ -229,10 +229,10 @@ class Directory:
     def nameless(self) -> BinaryIO:
         """Make a file without a name: it is gone when it is closed, or its process ends."""
         with self._opened() as fd:
-            name, made = self._temporary(fd, 0o600, getattr(os, "O_TEMPORARY", 0))
+            name, file = self._temporary(fd, 0o600, getattr(os, "O_TEMPORARY", 0))
             if _RELATIVE:
                 os.unlink(name, dir_fd=fd)
-        return os.fdopen(made, "w+b", buffering=0)
+        return os.fdopen(file, "w+b", buffering=0)
 
     def open(self, name: str) -> BinaryIO:
         """Open a regular file for reading.
@@ -271,9 +271,9 @@ class Directory:
         Raises:
             OSError: there is nothing, or the system has no links.
         """
-        there = self if to is None else to
-        with self._opened() as fd, there._opened() as other:
-            names = self._at(name), there._at(second)
+        target = self if to is None else to
+        with self._opened() as fd, target._opened() as other:
+            names = self._at(name), target._at(second)
             os.link(*names, src_dir_fd=fd, dst_dir_fd=other, follow_symlinks=False)
 
     def rename(self, name: str, new: str) -> None:
@@ -334,12 +334,12 @@ class Directory:
                 with os.scandir(self.path) as found:
                     yield found
                 return
-            own = os.open(".", _DIRECTORY, dir_fd=fd)  # with a place in the listing of its own
+            own_fd = os.open(".", _DIRECTORY, dir_fd=fd)  # with a place in the listing of its own
             try:
-                with os.scandir(own) as found:
+                with os.scandir(own_fd) as found:
                     yield found
             finally:
-                os.close(own)
+                os.close(own_fd)
 
     def names(self) -> set[str]:
         """List the names of the complete, regular files in it; none without

@@ -28,10 +28,10 @@ def write_whole(path: Path, content: str | bytes) -> None:
 
 def nearest_there(path: Path) -> Path:
     """Return `path` if it exists, else the nearest folder above it that does."""
-    there = path.absolute()
-    while not there.exists():
-        there = there.parent
-    return there
+    place = path.absolute()
+    while not place.exists():
+        place = place.parent
+    return place
 
 
 def bytes_of(path: Path) -> int:

@@ -341,10 +341,10 @@ class Imaging:
             left = self.memory_limit - others
             if apart.nbytes > left:
                 raise self._too_large(sample, apart.nbytes, left, self.memory_limit, "the twin")
-        there = None if self.room is None else await self.room()
+        available = None if self.room is None else await self.room()
         need = sum(memory_of(body) for body in apart.bodies)
-        if there is not None and need > there:
-            raise self._too_large(sample, need, there, there, "the projector")
+        if available is not None and need > available:
+            raise self._too_large(sample, need, available, available, "the projector")
 
     def _too_large(self, sample: Sample, need: int, left: int, limit: int, who: str) -> RpcError:
         """Make the error for a sample that needs more memory than is left."""
@@ -401,9 +401,9 @@ class Imaging:
 
     async def _send(self, apart: _Apart, name: str, pieces: Pieces) -> None:
         """Send the pieces of a sample and record their names."""
-        whole = pieces == "part" and len(apart.bodies) == 1
+        single = pieces == "part" and len(apart.bodies) == 1
         apart.names = [
-            await self._put(name if whole else f"{name}, {pieces} {i}", body)
+            await self._put(name if single else f"{name}, {pieces} {i}", body)
             for i, body in enumerate(apart.bodies)
         ]
 
@@ -415,11 +415,11 @@ class Imaging:
     async def _forget_old(self) -> None:
         """Drop the least recently used samples beyond the limits; with `_sending` held."""
         stays = self._pinned_keys()
-        most = math.inf if self.memory_limit is None else self.memory_limit
+        limit_bytes = math.inf if self.memory_limit is None else self.memory_limit
         used = sum(apart.nbytes for apart in self._known.values())
         newest = next(reversed(self._known))
         for key, apart in list(self._known.items()):
-            if used <= most and len(self._known) <= MAX_SAMPLES:
+            if used <= limit_bytes and len(self._known) <= MAX_SAMPLES:
                 return
             if key in stays or key == newest or apart.users:
                 continue

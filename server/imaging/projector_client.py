@@ -113,15 +113,15 @@ class ProjectorClient:
             "cone_vec": image.encode(cone_vec.rows),
             "detector": list(shape),
         }
-        whole = (len(cone_vec), *shape)
+        sizes = (len(cone_vec), *shape)
         for left in reversed(range(MAX_TRIES)):
             if body is not None:
                 await self.give(name, body)
             try:
-                return await self._ask("project", lambda c: c.ask_array("project", params, whole))
+                return await self._ask("project", lambda c: c.ask_array("project", params, sizes))
             except RpcError as error:
-                there = error.data.get("allowed") if isinstance(error.data, Mapping) else None
-                if body is None or not isinstance(there, list) or name in there or not left:
+                allowed = error.data.get("allowed") if isinstance(error.data, Mapping) else None
+                if body is None or not isinstance(allowed, list) or name in allowed or not left:
                     raise
             self._sent.pop(name, None)  # it was forgotten for another, or removed by another client
         raise AssertionError("the last try returns or raises")

@@ -139,7 +139,7 @@ class ProjectorPool:
         deadline = loop.time() + self.patience_s
         late = 0.0
         running: dict[asyncio.Future[Any], _Member] = {}
-        asked: set[_Member] = set()
+        members: set[_Member] = set()
         refused: set[_Member] = set()
         try:
             while True:
@@ -147,9 +147,9 @@ class ProjectorPool:
                 if self._turn is None or self._turn.done():
                     self._turn = loop.create_future()
                 wanted = not running or now >= late
-                member = self._free(asked | refused, now) if wanted else None
+                member = self._free(members | refused, now) if wanted else None
                 if member is not None:
-                    asked.add(member)
+                    members.add(member)
                     asking = self._ask(member, name, value, views, shape)
                     running[self._begin(member, asking)] = member
                     late = now + LATE_S + LATE_FACTOR * (member.pace_s or 0.0) * len(views or ())
@@ -175,7 +175,7 @@ class ProjectorPool:
                         running.clear()  # late requests keep their place until they are answered
                         return images
                 if not running:
-                    asked.clear()
+                    members.clear()
         finally:
             for task in running:
                 task.cancel()
@@ -183,9 +183,9 @@ class ProjectorPool:
     def _free(self, asked: set[_Member], now: float) -> _Member | None:
         """Choose the next projector: of the free ones that with least to do,
         then the fastest."""
-        most = MAX_OPEN_REQUESTS if len(self) > 1 else math.inf
+        limit = MAX_OPEN_REQUESTS if len(self) > 1 else math.inf
         free = (
-            m for m in self._members if m not in asked and m.open < most and m.rests_until <= now
+            m for m in self._members if m not in asked and m.open < limit and m.rests_until <= now
         )
         return min(free, key=lambda m: (m.open, m.pace_s or 0.0), default=None)
 

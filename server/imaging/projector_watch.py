@@ -75,11 +75,11 @@ class ProjectorWatch:
         Args:
             client: of the projector.
         """
-        asked = asyncio.ensure_future(client.health())
+        answer = asyncio.ensure_future(client.health())
         try:
-            if not (await asyncio.wait([asked], timeout=self.silent_s))[0]:
+            if not (await asyncio.wait([answer], timeout=self.silent_s))[0]:
                 self._found(client, f"the projector at {client.host}:{client.port} does not answer")
-            await asked
+            await answer
         except ProjectorUnavailable as error:
             self._found(client, str(error))
         except RpcError:  # an answer, too
@@ -87,7 +87,7 @@ class ProjectorWatch:
         else:
             self._found(client, None)
         finally:
-            asked.cancel()
+            answer.cancel()
 
     def _found(self, client: Watched, problem: str | None) -> None:
         """Record the problem of one projector; call `changed` if the overall one changes."""

@@ -75,12 +75,12 @@ def with_spectra(machine: Machine, physics: Physics) -> Machine:
     if physics == "ideal":
         return machine
     tube = machine.tube
-    least, most = voltages()
-    low = max(least, tube.min_kV)
-    high = min(most, tube.max_kV)
+    lowest, highest = voltages()
+    low = max(lowest, tube.min_kV)
+    high = min(highest, tube.max_kV)
     if not low <= tube.kV <= high:
-        said = f"physics {physics} has no spectrum for the tube's {tube.kV:g} kV"
-        raise LimitError.instead(said, tube.kV, f"{low:g} to {high:g} kV")
+        message = f"physics {physics} has no spectrum for the tube's {tube.kV:g} kV"
+        raise LimitError.instead(message, tube.kV, f"{low:g} to {high:g} kV")
     held = tube.model_copy(update={"min_kV": low, "max_kV": high})
     return machine.model_copy(update={"tube": held})
 
@@ -421,12 +421,12 @@ def predict(
     Raises:
         RpcError: an argument that the machine does not allow.
     """
-    told = asdict(exposure_forecast.expose(phantom, machine=machine, **settings))
-    told["transmission"]["edges"] = told["transmission"]["edges"][:-1]  # no infinity in JSON
-    told |= {
+    answer = asdict(exposure_forecast.expose(phantom, machine=machine, **settings))
+    answer["transmission"]["edges"] = answer["transmission"]["edges"][:-1]  # no infinity in JSON
+    answer |= {
         "sample": phantom.name,
-        "best": told["best"][:MAX_PROPOSALS],
-        "frames": told.pop("images"),
+        "best": answer["best"][:MAX_PROPOSALS],
+        "frames": answer.pop("images"),
     }
-    result = ExposurePrediction.model_validate(told, strict=False)
+    result = ExposurePrediction.model_validate(answer, strict=False)
     return list(encoded(result, codec).pieces)

@@ -662,8 +662,8 @@ class _Link(asyncio.BufferedProtocol):
     def _full(self) -> bool:
         """Whether so much waits that reading pauses; an incomplete message may be completed."""
         ahead = self.wire.pending if self.wire.whole or not self.let_in else 0
-        most = READ_AHEAD_BYTES if self.let_in else MAX_INLINE_BYTES
-        return self._load >= self.limits.max_waiting or ahead > most
+        limit_bytes = READ_AHEAD_BYTES if self.let_in else MAX_INLINE_BYTES
+        return self._load >= self.limits.max_waiting or ahead > limit_bytes
 
     def _relax(self) -> None:
         """Resume reading once enough messages have been served."""

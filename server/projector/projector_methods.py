@@ -71,10 +71,10 @@ async def volume_put(context: Context, client: JobClient, id: Id, p: wire.Volume
     what = p.grid or p.mesh
     assert what is not None
     assert p.data is not None
-    received, made = context.store.chunk(client, p.name, what, p.start, p.data)
-    complete = made is not None
-    if made is not None:
-        ready = made
+    received, complete_body = context.store.chunk(client, p.name, what, p.start, p.data)
+    complete = complete_body is not None
+    if complete_body is not None:
+        ready = complete_body
         volume = await context.run(client, id, lambda: _prepared(ready()))
         assert isinstance(volume, Volume | TriangleMesh)
         context.store.put(p.name, volume, evictable=p.evictable)
@@ -91,9 +91,9 @@ async def volume_get(context: Context, client: JobClient, id: Id, p: wire.Volume
     if not isinstance(volume, Volume):
         raise invalid_params(f"{p.name!r} is a mesh or an analytic scene and has no voxels")
     data = volume.data
-    whole = await context.run(client, id, lambda: np.ascontiguousarray(data))
-    assert isinstance(whole, np.ndarray)
-    return await context.send_array(client, id, whole)
+    voxels = await context.run(client, id, lambda: np.ascontiguousarray(data))
+    assert isinstance(voxels, np.ndarray)
+    return await context.send_array(client, id, voxels)
 
 
 async def volume_list(context: Context, client: JobClient, id: Id, p: Params) -> object:
@@ -174,12 +174,12 @@ async def backproject(context: Context, client: JobClient, id: Id, p: wire.Backp
     old = _accumulator(context, p.into, p.grid)
     needed = p.grid.nbytes
     context.store.reserve("a back projection", needed * (2 if old is None else 1))
-    made = await context.run(client, id, lambda: _backproject(p, old))
-    assert isinstance(made, Volume)
+    volume = await context.run(client, id, lambda: _backproject(p, old))
+    assert isinstance(volume, Volume)
     if p.into is not None:
-        context.store.put(p.into, made)
-        return {"dtype": "float32", "shape": list(made.shape), "parts": 0}
-    return await context.send_array(client, id, np.asarray(made.data))
+        context.store.put(p.into, volume)
+        return {"dtype": "float32", "shape": list(volume.shape), "parts": 0}
+    return await context.send_array(client, id, np.asarray(volume.data))
 
 
 async def health(context: Context, client: JobClient, id: Id, p: Params) -> object:
@@ -256,11 +256,11 @@ def _prepared(volume: Volume | TriangleMesh) -> Volume | TriangleMesh:
 def _backproject(p: wire.Backproject, old: Volume | None) -> Volume:
     """Compute a back projection, added to `old`."""
     blank = np.broadcast_to(np.float32(0), p.grid.shape)
-    made = back(p.projections, p.cone_vec, Volume(blank, p.grid.voxel_mm, p.grid.center_mm))
-    data = np.ascontiguousarray(made.data)
+    volume = back(p.projections, p.cone_vec, Volume(blank, p.grid.voxel_mm, p.grid.center_mm))
+    data = np.ascontiguousarray(volume.data)
     if old is not None:
         data = data + old.data
-    return replace(made, data=data)
+    return replace(volume, data=data)
 
 
 ANSWERS: Final[Mapping[str, Answer]] = {

@@ -255,10 +255,10 @@ class ProjectorLink:
         Raises:
             OSError: no server answers.
         """
-        made = cls()
+        link = cls()
         loop = asyncio.get_running_loop()
-        await loop.create_connection(lambda: made.link, host, port, ssl=ssl)
-        return made
+        await loop.create_connection(lambda: link.link, host, port, ssl=ssl)
+        return link
 
     @property
     def lost(self) -> bool:
@@ -339,9 +339,9 @@ class ProjectorLink:
         """Wait as long as the projector is alive; close the connection to one that is
         silent for `SILENT_S`."""
         loop = asyncio.get_running_loop()
-        asked = loop.time()
+        asked_at = loop.time()
         while not (await asyncio.wait([answer], timeout=ASK_AGAIN_S))[0]:
-            if loop.time() - max(asked, self.link.heard) > SILENT_S:
+            if loop.time() - max(asked_at, self.link.heard) > SILENT_S:
                 self.close()
             if not self._notes:
                 self._keep(asyncio.ensure_future(self.ask("health", {})))

@@ -243,9 +243,9 @@ def _joined(before: History, in_force: History) -> History:
     if len(in_force) != 1:
         return in_force
     [name] = in_force
-    there = [i for i, known in enumerate(before) if known == name]
-    if there:
-        return before[: there[-1] + 1]
+    places = [i for i, known in enumerate(before) if known == name]
+    if places:
+        return before[: places[-1] + 1]
     return [*before, name]
 
 

@@ -55,22 +55,22 @@ def fit(root: Directory, asked: p.CalibrationFit, *_: object) -> p.CalibrationFi
         markers=marks,
         scale=asked.scale,
     )
-    told = dict(found.document)
+    document = dict(found.document)
     fitted = found.calibration.fit
     if fitted is not None:
         if asked.residuals:
             c = fitted.certificate
-            told["residuals_px"] = [
+            document["residuals_px"] = [
                 [bead if used else None for bead, used in zip(frame, some, strict=True)]
                 for frame, some in zip(c.residuals_px.tolist(), c.used.tolist(), strict=True)
             ]
-        told["steps"] = [
+        document["steps"] = [
             {"frames": n, "covariance": None if matrix is None else matrix.tolist()}
             for n, matrix in covariance_by_step(fitted, asked.steps)
         ]
     if asked.tracks:
-        told["tracks"] = tracks_document(found)
-    return p.CalibrationFitResult.model_validate(from_root(told, root.path))
+        document["tracks"] = tracks_document(found)
+    return p.CalibrationFitResult.model_validate(from_root(document, root.path))
 
 
 def align(root: Directory, asked: p.CalibrationAlign, *_: object) -> p.CalibrationAlignResult:

@@ -87,8 +87,8 @@ class DatasetWriter:
     @property
     def missing(self) -> tuple[str, ...]:
         """Names of the missing images, in the order taken."""
-        there = self.present
-        return tuple(dict.fromkeys(f for f in self.record.files if f not in there))
+        present = self.present
+        return tuple(dict.fromkeys(f for f in self.record.files if f not in present))
 
     def put(self, name: str, image: npt.NDArray[np.uint16]) -> None:
         """Write one image.
@@ -152,16 +152,16 @@ class DatasetWriter:
             DatasetExistsError: it has files and the scan is not resumed, or those of
                 another scan.
         """
-        there = self._files.names()
-        if there and not resume:
+        names = self._files.names()
+        if names and not resume:
             raise ds.DatasetExistsError(
-                f"{self.folder} holds {len(there)} files already; allowed: another name, or resume",
-                {"path": str(self.folder), "files": len(there)},
+                f"{self.folder} holds {len(names)} files already; allowed: another name, or resume",
+                {"path": str(self.folder), "files": len(names)},
             )
-        if DOCUMENT in there:
+        if DOCUMENT in names:
             self._check_same()
         self._files.sweep()
-        found = there & set(self.record.files)
+        found = names & set(self.record.files)
         return {name for name in found if self._whole(name)}
 
     def _whole(self, name: str) -> bool:

@@ -51,9 +51,9 @@ class UsedBytes:
         """Sum up the bytes of all files in it and its folders; links are not followed."""
         with suppress(OSError):
             changed_ns = os.stat(self._root.fileno() or self._root.path).st_mtime_ns
-            there: dict[str, _Seen] = {}
-            total = self._count(self._root, "", changed_ns, there)
-            self._seen = there  # without folders that have gone
+            counted: dict[str, _Seen] = {}
+            total = self._count(self._root, "", changed_ns, counted)
+            self._seen = counted  # without folders that have gone
             return total
         return 0
 

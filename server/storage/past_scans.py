@@ -197,9 +197,9 @@ class _Scan:
     @property
     def beam(self) -> tuple[float | None, float | None]:
         """kV and W of the projections."""
-        said = self.document.tube if self.document else self.texts and self.texts.settings
-        if said:
-            return (said.kV, said.power_W)
+        settings = self.document.tube if self.document else self.texts and self.texts.settings
+        if settings:
+            return (settings.kV, settings.power_W)
         return (None, None)
 
 
@@ -298,20 +298,20 @@ def _info(path: Path, modified: float, scan: _Scan) -> p.DatasetInfo:
     document = scan.document
     kV, power_W = scan.beam
     if document is None:
-        there = len(folder.projections)
+        present = len(folder.projections)
         texts = scan.texts
-        told = {}
-        if texts is not None and (said := texts.settings) is not None:
-            told = {
+        changes = {}
+        if texts is not None and (settings := texts.settings) is not None:
+            changes = {
                 "state": "complete" if texts.complete else "incomplete",
                 "reason": texts.reason,
-                "started": said.started and said.started.isoformat(),
-                "sample": said.sample_name or "",
-                "operator": said.operator or "",
-                "machine": said.scanner_name,
-                "mode": said.mode,
+                "started": settings.started and settings.started.isoformat(),
+                "sample": settings.sample_name or "",
+                "operator": settings.operator or "",
+                "machine": settings.scanner_name,
+                "mode": settings.mode,
                 "shape": texts.shape,
-                "exposure_ms": said.exposure_ms,
+                "exposure_ms": settings.exposure_ms,
                 "projections": len(texts),
                 "kV": kV,
                 "power_W": power_W,
@@ -319,11 +319,11 @@ def _info(path: Path, modified: float, scan: _Scan) -> p.DatasetInfo:
         info = p.DatasetInfo(
             name=path.name,
             modified=modified,
-            projections=there,
-            present=there,
+            projections=present,
+            present=present,
             problem=scan.problem[:500],
         )
-        return info.model_copy(update=told)
+        return info.model_copy(update=changes)
     lost = folder.lost([f.file for f in document.frames])
     taken = document.files("projection")
     detector = document.detector
@@ -393,7 +393,7 @@ def _list(
         elif info == "":
             continue
         info = _as_it_runs(info, around)
-        said = (
+        texts = (
             info.name,
             info.state,
             info.sample,
@@ -403,7 +403,7 @@ def _list(
             info.started,
             f"{info.kV or 0:g}kV {info.exposure_ms or 0:g}ms {info.power_W or 0:g}W",
         )
-        if all(any(word in str(text).lower() for text in said) for word in words):
+        if all(any(word in str(text).lower() for text in texts) for word in words):
             unread += late
             found.append(info)
     shown = found[asked.start : asked.start + asked.count]
@@ -467,10 +467,10 @@ def _with_thumbnail(root: Directory, info: p.DatasetInfo, side: int, until: floa
         path, key = _place(root, info.name)
         if (side, key) not in _THUMBNAILS and time.monotonic() > until:
             return info
-        made = _THUMBNAILS.get((side, key), make)
+        thumbnail = _THUMBNAILS.get((side, key), make)
     except ds.DatasetError:
         return info
-    return info.model_copy(update={"thumbnail": made or None})
+    return info.model_copy(update={"thumbnail": thumbnail or None})
 
 
 # dataset.get
@@ -516,9 +516,9 @@ def _get(
 
 def _same(scan: _Scan, around: TwinContext) -> bool:
     """Return whether the twin has the machine and the profile of a data set."""
-    said = scan.document
+    document = scan.document
     texts = scan.texts
-    machine, profile = (said.machine, said.profile) if said else ({}, None)
+    machine, profile = (document.machine, document.profile) if document else ({}, None)
     if texts is not None and texts.profile is not None and texts.positions:
         machine = texts.machine.model_dump(mode="json", by_alias=True)
         profile = texts.profile.model_dump(mode="json")
@@ -653,8 +653,8 @@ def _frame(
     before = sum(f.kind == "projection" for f in images[: asked.index])
     kV, power_W = scan.beam
     size = small.nbytes if codec is Codec.MSGPACK else small.nbytes * 4 // 3
-    if size > (most := MAX_ANSWER[codec] - (1 << 16)):  # beside the pixels
-        raise too_large("an image (ask for a binned one)", size, most)
+    if size > (limit_bytes := MAX_ANSWER[codec] - (1 << 16)):  # beside the pixels
+        raise too_large("an image (ask for a binned one)", size, limit_bytes)
     return p.DatasetFrameResult(
         **image.encode(small),  # type: ignore[arg-type]
         name=asked.name,

@@ -138,8 +138,8 @@ class Incoming:
         self._folder.make()
         with self._writing():
             file = self._folder.nameless()
-        self._open[head.name] = made = _Open(head, file)
-        return made
+        self._open[head.name] = upload = _Open(head, file)
+        return upload
 
     def _make_room(self, name: str, more: int) -> None:
         """Drop the oldest other uploads until `more` bytes fit."""

@@ -278,9 +278,9 @@ class SampleStore:
         without an upload unless its damaged description is kept."""
         self._folder.sweep([TEMPORARY])
         known = {_bytes_file(name, head.revision) for name, head in self._heads.items()}
-        there = self._folder.names()
-        for file in fnmatch.filter(there, f"*.{'?' * 16}.bin"):
-            damaged = f"{file.split('.')[0]}{own.ASIDE}.json" in there
+        names = self._folder.names()
+        for file in fnmatch.filter(names, f"*.{'?' * 16}.bin"):
+            damaged = f"{file.split('.')[0]}{own.ASIDE}.json" in names
             if file not in known and not damaged:
                 with suppress(OSError):
                     self._folder.unlink(file)

@@ -114,22 +114,22 @@ class Substance:
 
     def __post_init__(self) -> None:
         if not 0.0 < (density := self.density_g_cm3) <= MAX_DENSITY_G_CM3:
-            said = f"{self.name}: density {density:g} g/cm3"
-            raise LimitError.instead(said, density, f"above 0 and at most {MAX_DENSITY_G_CM3:g}")
+            message = f"{self.name}: density {density:g} g/cm3"
+            raise LimitError.instead(message, density, f"above 0 and at most {MAX_DENSITY_G_CM3:g}")
         for symbol, part in self.fractions:
             _row(symbol)
             if not part > 0.0:
-                said = f"{self.name}: mass fraction {part:g} of {symbol}"
-                raise LimitError.instead(said, part, "above 0")
-        whole = sum(part for _, part in self.fractions)
-        if not math.isclose(whole, 1.0, abs_tol=2e-3):
-            raise LimitError.instead(f"{self.name}: mass fractions add up to {whole:g}", whole, 1.0)
+                message = f"{self.name}: mass fraction {part:g} of {symbol}"
+                raise LimitError.instead(message, part, "above 0")
+        total = sum(part for _, part in self.fractions)
+        if not math.isclose(total, 1.0, abs_tol=2e-3):
+            raise LimitError.instead(f"{self.name}: mass fractions add up to {total:g}", total, 1.0)
 
     @property
     def parts(self) -> list[tuple[int, float]]:
         """Rows of its elements in the tables and mass fractions, which add up to 1 exactly."""
-        whole = sum(part for _, part in self.fractions)
-        return [(_row(symbol), part / whole) for symbol, part in self.fractions]
+        total = sum(part for _, part in self.fractions)
+        return [(_row(symbol), part / total) for symbol, part in self.fractions]
 
     @classmethod
     def of(cls, name: str, formula: str, density_g_cm3: float) -> Substance:
@@ -243,8 +243,8 @@ def parse_formula(formula: str) -> dict[str, float]:
 def mass_fractions(atoms: Mapping[str, float]) -> dict[str, float]:
     """Compute the mass fractions of a compound from its numbers of atoms."""
     masses = {symbol: n * float(tables().molar_mass[_row(symbol)]) for symbol, n in atoms.items()}
-    whole = sum(masses.values())
-    return {symbol: mass / whole for symbol, mass in masses.items()}
+    total = sum(masses.values())
+    return {symbol: mass / total for symbol, mass in masses.items()}
 
 
 def _row(symbol: str) -> int:
@@ -263,5 +263,5 @@ def _row(symbol: str) -> int:
 def _unreadable(formula: str, at: int) -> LimitError:
     """Make the error for a formula that cannot be parsed at character `at`."""
     allowed = "element symbols with counts and parentheses, such as C15H17N or Ca5(PO4)3OH"
-    said = f"formula {formula!r} cannot be read at character {at + 1}"
-    return LimitError.instead(said, formula, allowed, at=at)
+    message = f"formula {formula!r} cannot be read at character {at + 1}"
+    return LimitError.instead(message, formula, allowed, at=at)

@@ -196,9 +196,9 @@ class PairStack:
         shape = (*lower.shape[:-1], len(self.pairs), 3)
         middle = (0.5 * (lower + upper) @ self.slides).reshape(shape) + self.offset
         spread = (0.5 * (upper - lower) @ self._reach).reshape(shape)
-        apart = np.maximum(middle - self.below, -middle - self.above) - spread
-        apart = np.maximum(apart, 0.0)
-        return np.asarray(np.sqrt((apart * apart).sum(axis=-1)))
+        distance = np.maximum(middle - self.below, -middle - self.above) - spread
+        distance = np.maximum(distance, 0.0)
+        return np.asarray(np.sqrt((distance * distance).sum(axis=-1)))
 
 
 def build_scene(

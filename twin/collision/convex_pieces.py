@@ -110,10 +110,10 @@ def _best_cut(piece: _Piece) -> Sequence[_Piece] | None:
             halves = [_clip(piece.triangles, axis, at, side) for side in (-1.0, 1.0)]
             if any(len(h) == 0 for h in halves):
                 continue
-            made = [_Piece(h) for h in halves]
-            volume = sum(m.volume for m in made)
+            pieces = [_Piece(h) for h in halves]
+            volume = sum(m.volume for m in pieces)
             if volume < wanted:
-                best = made
+                best = pieces
                 wanted = volume
     return best
 

@@ -39,11 +39,11 @@ def check_home(machine: Machine, profile: Profile, file: str) -> None:
         raise wrong(f"{what} {more}", sod=sod, sdd=sdd)
     for at, offset in ((stage, profile.c_obj), (panel, profile.c_det)):
         least = at.least + offset
-        most = at.most + offset
+        high = at.most + offset
         if least <= 0.0:
-            what = f"{at.name} goes from {least:g} to {most:g} mm over the travel ({at.total}; zero"
+            what = f"{at.name} goes from {least:g} to {high:g} mm over the travel ({at.total}; zero"
             more = f"offset {offset:g} mm); allowed: above 0 everywhere, in front of the focal spot"
-            raise wrong(f"{what} {more}", asked=[least, most], allowed="> 0")
+            raise wrong(f"{what} {more}", asked=[least, high], allowed="> 0")
     found = touching(build_scene(machine, profile), {})
     if found:
         what = f"at home {_pairs(found)}; the safety margin is {machine.safety_margin_mm:g} mm"

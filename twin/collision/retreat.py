@@ -81,8 +81,8 @@ def _of_pair(scene: CollisionScene, path: Path, pair: Pair) -> Contact | None:
     until = math.inf if deeper is None else motion.time(deeper[1])
     free = _free_from(motion, scene.separation(pair), scene.limits, until)
     if free is not None:
-        alone = replace(scene, pairs=(pair,), distant=())
-        return first_contact(alone, path.after(free))
+        pair_scene = replace(scene, pairs=(pair,), distant=())
+        return first_contact(pair_scene, path.after(free))
     if deeper is None:
         return None
     last = motion.time(deeper[0])

@@ -67,11 +67,11 @@ def separation_of(
         if not distance > 0.0:
             return _TOUCHING
         on_a, on_b = result.nearest_points
-        apart = on_a - on_b
-        length = math.sqrt(apart @ apart)
+        difference = on_a - on_b
+        length = math.sqrt(difference @ difference)
         if length == 0.0:
             return _TOUCHING
-        normal = apart / length
+        normal = difference / length
         # The empty slab across the normal: no two points are nearer than it is wide.
         gap = float(normal @ offset - a.support(-normal @ ra) - b.support(normal @ rb))
         if gap < distance - MAX_DEFICIT_MM:

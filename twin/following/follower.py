@@ -144,9 +144,9 @@ class Follower:
             if quiet > max(FORGOTTEN_AFTER_S, waiting.most_s):
                 mirror = _rests(mirror.finished(waiting.heard), waiting)
         for name, axis in mirror.axes.items() if mirror.ends is False else ():
-            told = axis.heard_s or 0.0
+            heard_s = axis.heard_s or 0.0
             path = axis.path
-            if path is not None and path.end < told < now - axis.delay_s - SLACK_S:
+            if path is not None and path.end < heard_s < now - axis.delay_s - SLACK_S:
                 mirror = self._arrival(mirror, name, axis.position, path.target, now)
         if mirror.due_s is not None and now > mirror.due_s + SLACK_S:
             due = f"{self._next(mirror)} was due {now - mirror.due_s:.1f} s ago"
@@ -233,11 +233,11 @@ class Follower:
             return _after(mirror.finished(heard), heard.command, self.machine, now)
         if not heard.asks:
             mirror = self._over(_flushed(mirror, now), heard.words[0], now)
-        name, asked = heard.words[:2]
-        if not (name in FIXED or self.machine.has(name)) and find(name, asked) is not None:
+        name, argument = heard.words[:2]
+        if not (name in FIXED or self.machine.has(name)) and find(name, argument) is not None:
             what = f"{heard.text!r} is not followed: {unknown_axis(name, self.machine).message}"
             mirror = _alarm(mirror, now, "error", "unknown_axis", name, what)
-        if asked.lower() == "stop":
+        if argument.lower() == "stop":
             mirror = replace(mirror, axes={n: a.at_rest for n, a in mirror.axes.items()})
         waiting = Waiting(heard, now, now)
         if heard.command is not None:
@@ -401,8 +401,8 @@ class Follower:
             return mirror.with_waiting(waiting, superseded=True, written=True)
         if waiting.predicted_s is not None and not waiting.superseded:
             least = took - heard.late_s
-            most = took + waiting.heard.late_s
-            if most < waiting.least_s - SLACK_S or least > waiting.most_s + SLACK_S:
+            longest = took + waiting.heard.late_s
+            if longest < waiting.least_s - SLACK_S or least > waiting.most_s + SLACK_S:
                 mirror = self._outside(mirror, waiting, took, now)
             else:
                 mirror = mirror.cleared(waiting.heard.words[0], "range")
@@ -424,15 +424,15 @@ class Follower:
         axis = waiting.heard.words[0]
         motor = motor_reply(reply_bytes(heard.reply))
         at = motor.position if motor is not None else _number(heard.reply)
-        own = [n for n in waiting.targets if _stays(mirror, n, waiting)]
+        motors = [n for n in waiting.targets if _stays(mirror, n, waiting)]
         mirror = _rests(mirror, waiting)
-        for name in own:
+        for name in motors:
             mirror = mirror.with_axis(name, position=waiting.targets[name], heard_s=now)
         if at is None:
             return mirror
-        name, there = self._motor(axis, at)
-        mirror = self._arrival(mirror, name, there, waiting.targets[name], now)
-        mirror = mirror.with_axis(name, position=there) if name in own else mirror
+        name, reply = self._motor(axis, at)
+        mirror = self._arrival(mirror, name, reply, waiting.targets[name], now)
+        mirror = mirror.with_axis(name, position=reply) if name in motors else mirror
         if motor is None:
             return mirror
         return self._compared(mirror, name, motor, now)

@@ -280,9 +280,9 @@ class Mirror:
 
     def cleared(self, about: str, *kinds: str) -> Mirror:
         """End the conditions about something, of these kinds or of all."""
-        gone = {k for k in self.active if k[1] == about and (not kinds or k[0] in kinds)}
-        if gone:
-            return replace(self, active=self.active - gone)
+        ended = {k for k in self.active if k[1] == about and (not kinds or k[0] in kinds)}
+        if ended:
+            return replace(self, active=self.active - ended)
         return self
 
     def to_dict(self, now: float) -> dict[str, object]:

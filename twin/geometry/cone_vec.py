@@ -190,9 +190,9 @@ class ConeVec:
             [-4.0, 4.0]
         """
         if not np.isfinite(rise) or not (np.isfinite(turns) and turns > 0):
-            asked = f"rise {rise:g} mm a turn, {turns:g} turns"
+            request = f"rise {rise:g} mm a turn, {turns:g} turns"
             allowed = "finite, more than 0 turns"
-            raise GeometryError.instead(asked, [rise, turns], allowed)
+            raise GeometryError.instead(request, [rise, turns], allowed)
         given = _stage_angles(angles, turns)
         rises = rise * (given - (given[0] + given[-1]) / 2) / FULL_TURN_DEG
         pitch = _numbers("pixel", pixel, 2, "mm", repeated=True)
@@ -201,11 +201,11 @@ class ConeVec:
         places = {"sod": sod, "sdd": sdd, "height": height}
         sod, sdd, height = (_numbers(name, value, 1, "mm")[0] for name, value in places.items())
         if not 0.0 < sod <= sdd:
-            asked = f"sod {sod:g} mm and sdd {sdd:g} mm"
-            raise GeometryError.instead(asked, [sod, sdd], "0 < sod <= sdd")
+            request = f"sod {sod:g} mm and sdd {sdd:g} mm"
+            raise GeometryError.instead(request, [sod, sdd], "0 < sod <= sdd")
         if min(pitch) <= 0.0:
-            asked = f"pixel {pitch[0]:g} x {pitch[1]:g} mm"
-            raise GeometryError.instead(asked, list(pitch), "more than 0")
+            request = f"pixel {pitch[0]:g} x {pitch[1]:g} mm"
+            raise GeometryError.instead(request, list(pitch), "more than 0")
         right = np.array(COLUMN_DIRECTION)
         below = np.array(ROW_DIRECTION)
         # At stage angle 0; the object turns clockwise, so these turn the other way in its
@@ -538,13 +538,13 @@ class ConeVec:
             ((76, 96), (10, 20))
         """
         own = self.detector_shape
-        asked = None if shape is None else check_shape(shape)
-        if asked is not None and own is not None and asked != own:
+        given = None if shape is None else check_shape(shape)
+        if given is not None and own is not None and given != own:
             raise GeometryError(
-                f"detector shape {asked}; this geometry is of a detector of {own} (rows, columns)",
-                {"asked": list(asked), "allowed": list(own)},
+                f"detector shape {given}; this geometry is of a detector of {own} (rows, columns)",
+                {"asked": list(given), "allowed": list(own)},
             )
-        found = own if asked is None else asked
+        found = own if given is None else given
         if found is None:
             raise GeometryError(
                 "the detector's shape is not known; give shape=(rows, columns), or a geometry "
@@ -752,8 +752,10 @@ class ConeVec:
         shift_u = (cols // factor * factor - cols) / 2
         shift_v = (rows // factor * factor - rows) / 2
         centre = self.detector + shift_u * self.u + shift_v * self.v
-        own = None if self.detector_shape is None else (rows // factor, cols // factor)
-        return ConeVec.from_vectors(self.source, centre, self.u * factor, self.v * factor, own)
+        binned_shape = None if self.detector_shape is None else (rows // factor, cols // factor)
+        return ConeVec.from_vectors(
+            self.source, centre, self.u * factor, self.v * factor, binned_shape
+        )
 
 
 def check_shape(shape: Shape2) -> Shape2:

@@ -62,8 +62,8 @@ class Motion:
     def near(self, other: Motion) -> bool:
         """Return whether two estimates of one motion differ by less than a
         hundredth of a sigma."""
-        apart = np.abs(self.values - other.values)
-        return bool((apart <= 0.01 * np.nan_to_num(self.sigma)).all())
+        difference = np.abs(self.values - other.values)
+        return bool((difference <= 0.01 * np.nan_to_num(self.sigma)).all())
 
     def applied(self, poses: Poses, sign: float = 1.0) -> Poses:
         """Add the deviations to axis, angle, source and detector of poses, `sign` times.

@@ -141,13 +141,13 @@ class Axis(_Frozen):
     def _ordered(self) -> Axis:
         """Check that home, speed and acceleration are within their limits."""
         _refuse_if(self.lower > self.upper, "upper", self.upper, f"at least lower, {self.lower}")
-        most = f"within lower and upper, [{self.lower}, {self.upper}]"
-        _refuse_if(not self.lower <= self.home <= self.upper, "home", self.home, most)
-        most = f"at most max_speed, {self.max_speed}"
-        _refuse_if(self.speed > self.max_speed, "speed", self.speed, most)
-        most = f"at most max_acceleration, {self.max_acceleration}"
+        allowed = f"within lower and upper, [{self.lower}, {self.upper}]"
+        _refuse_if(not self.lower <= self.home <= self.upper, "home", self.home, allowed)
+        allowed = f"at most max_speed, {self.max_speed}"
+        _refuse_if(self.speed > self.max_speed, "speed", self.speed, allowed)
+        allowed = f"at most max_acceleration, {self.max_acceleration}"
         _refuse_if(
-            self.acceleration > self.max_acceleration, "acceleration", self.acceleration, most
+            self.acceleration > self.max_acceleration, "acceleration", self.acceleration, allowed
         )
         return self
 
@@ -166,13 +166,13 @@ class VirtualAxis(_Frozen):
     def _reads_what_it_moves(self) -> VirtualAxis:
         """Check that the axis reads a motor that it moves, at the inverse share."""
         _refuse_if(self.factor == 0.0, "factor", self.factor, "a number other than 0")
-        most = f"shares of motors, {self.of!r} (the `of`) among them"
-        _refuse_if(self.of not in self.moves, "moves", self.moves, most)
+        allowed = f"shares of motors, {self.of!r} (the `of`) among them"
+        _refuse_if(self.of not in self.moves, "moves", self.moves, allowed)
         for motor, share in self.moves.items():
             _refuse_if(share == 0.0, f"moves.{motor}", share, "a number other than 0, or left out")
         share = self.moves[self.of]
-        most = f"1 / factor, {1.0 / self.factor:g}, so that the axis gets where it is sent"
-        _refuse_if(abs(self.factor * share - 1.0) > 1e-6, f"moves.{self.of}", share, most)
+        allowed = f"1 / factor, {1.0 / self.factor:g}, so that the axis gets where it is sent"
+        _refuse_if(abs(self.factor * share - 1.0) > 1e-6, f"moves.{self.of}", share, allowed)
         return self
 
 
@@ -230,8 +230,8 @@ class DetectorSpec(_Frozen):
     def mode_names(self) -> tuple[str, ...]:
         """The camera modes that exist; the one at start is among them."""
         every = product(self.hardware_binning, self.software_binning, self.gains)
-        own = [f"HW{a}SW{b}{gain}" for a, b, gain in every]
-        return tuple(dict.fromkeys([self.mode, *self.modes, *own]))
+        names = [f"HW{a}SW{b}{gain}" for a, b, gain in every]
+        return tuple(dict.fromkeys([self.mode, *self.modes, *names]))
 
     def check_mode(self, mode: str) -> str:
         """Check that a camera mode exists; case and a prefixed number do not matter.
@@ -242,8 +242,8 @@ class DetectorSpec(_Frozen):
         Returns:
             `mode`, unchanged.
         """
-        own = {without_number(name) for name in self.mode_names if name not in self.modes}
-        if mode.strip() not in self.modes and without_number(mode) not in own:
+        unnumbered = {without_number(name) for name in self.mode_names if name not in self.modes}
+        if mode.strip() not in self.modes and without_number(mode) not in unnumbered:
             raise no_mode(mode, self.mode_names)
         return mode
 
@@ -259,11 +259,11 @@ class DetectorSpec(_Frozen):
         except LimitError as error:
             raise _refused("roi", self.roi, error.message) from None
         for i, (energy, left) in enumerate(self.response):
-            most = f"at most the photon's energy, {energy:g} keV"
-            _refuse_if(left > energy, f"response.{i}", [energy, left], most)
+            allowed = f"at most the photon's energy, {energy:g} keV"
+            _refuse_if(left > energy, f"response.{i}", [energy, left], allowed)
             before = self.response[i - 1][0] if i else 0.0
-            most = f"at a higher energy than the point before, {before:g} keV"
-            _refuse_if(energy <= before, f"response.{i}", [energy, left], most)
+            allowed = f"at a higher energy than the point before, {before:g} keV"
+            _refuse_if(energy <= before, f"response.{i}", [energy, left], allowed)
         return self
 
 
@@ -313,10 +313,10 @@ class TubeSpec(_Frozen):
     @model_validator(mode="after")
     def _starts_within(self) -> TubeSpec:
         """Check that the settings at start are within the tube's limits."""
-        most = f"from min_kV to max_kV, [{self.min_kV:g}, {self.max_kV:g}]"
-        _refuse_if(not self.min_kV <= self.kV <= self.max_kV, "kV", self.kV, most)
-        most = f"at most max_W, {self.max_W:g}"
-        _refuse_if(self.power_W > self.max_W, "power_W", self.power_W, most)
+        allowed = f"from min_kV to max_kV, [{self.min_kV:g}, {self.max_kV:g}]"
+        _refuse_if(not self.min_kV <= self.kV <= self.max_kV, "kV", self.kV, allowed)
+        allowed = f"at most max_W, {self.max_W:g}"
+        _refuse_if(self.power_W > self.max_W, "power_W", self.power_W, allowed)
         _refuse_if(self.spot_points == 2, "spot_points", 2, "1, or 3 to 1024")
         return self
 
@@ -446,8 +446,8 @@ class Timing(_Frozen):
         _require(self.spread, self.kinds, "spread", "kind of command")
         for kind, found in self.spread.items():
             middle = self.seconds(kind)
-            most = f"from p5_s to p95_s, [{found.p5_s:g}, {found.p95_s:g}]"
-            _refuse_if(not found.p5_s <= middle <= found.p95_s, f"{kind}_s", middle, most)
+            allowed = f"from p5_s to p95_s, [{found.p5_s:g}, {found.p95_s:g}]"
+            _refuse_if(not found.p5_s <= middle <= found.p95_s, f"{kind}_s", middle, allowed)
         return self
 
 
@@ -552,22 +552,22 @@ class Machine(_Frozen):
             _require(factors, self.axes, f"geometry.{quantity}", "axis")
             kind = "rotation" if quantity == "angle" else "linear"
             for name, factor in factors.items():
-                most = "a number other than 0, or left out"
-                _refuse_if(factor == 0.0, f"geometry.{quantity}.{name}", factor, most)
-                most = f"driven by {kind} axes alone; {NOT_MODELLED}"
-                _refuse_if(self.axes[name].kind != kind, f"geometry.{quantity}", name, most)
+                allowed = "a number other than 0, or left out"
+                _refuse_if(factor == 0.0, f"geometry.{quantity}.{name}", factor, allowed)
+                allowed = f"driven by {kind} axes alone; {NOT_MODELLED}"
+                _refuse_if(self.axes[name].kind != kind, f"geometry.{quantity}", name, allowed)
         for quantity in ("mount_x", "mount_y"):
             if quantity in self.fixed and not self.geometry.get(quantity):
-                most = "left out where no stage on the turntable moves along it"
-                raise _refused(f"fixed.{quantity}", self.fixed[quantity], most)
+                allowed = "left out where no stage on the turntable moves along it"
+                raise _refused(f"fixed.{quantity}", self.fixed[quantity], allowed)
         response = self.detector.response
         if response and response[-1][0] < self.tube.max_kV:
-            most = f"measured up to the tube's max_kV, {self.tube.max_kV:g} keV"
-            raise _refused("detector.response", response[-1], most)
+            allowed = f"measured up to the tube's max_kV, {self.tube.max_kV:g} keV"
+            raise _refused("detector.response", response[-1], allowed)
         taken = [*_COMPONENTS_OF_SCRIPTS, self.tube.name.lower()]
         for name in (*self.axes, *self.virtual_axes):
-            most = "another name: scripts, which tell no case apart, say it of other things"
-            _refuse_if(name.lower() in taken, f"axes.{name}", name, most)
+            allowed = "another name: scripts, which tell no case apart, say it of other things"
+            _refuse_if(name.lower() in taken, f"axes.{name}", name, allowed)
             taken.append(name.lower())
         for name, virtual in self.virtual_axes.items():
             _require([virtual.of], self.axes, f"virtual_axes.{name}.of", "axis")
@@ -612,8 +612,8 @@ class Machine(_Frozen):
             _require(chain, driving, f"components.{component.name}.axis", what)
             carrier = next((c for c in self.components if c.name == component.parent), None)
             if carrier is not None and self.chain(carrier) and carrier.anchor != component.anchor:
-                most = f"{carrier.anchor!r}, as that of the part that carries it, {carrier.name}"
-                raise _refused(f"components.{component.name}.anchor", component.anchor, most)
+                allowed = f"{carrier.anchor!r}, as that of the part that carries it, {carrier.name}"
+                raise _refused(f"components.{component.name}.anchor", component.anchor, allowed)
             turns = self.geometry.get("angle", {})
             centring = [i for i, motor in enumerate(chain) if self._on_turntable(motor)]
             turning = [chain.index(motor) if motor in chain else -1 for motor in turns]
@@ -622,11 +622,13 @@ class Machine(_Frozen):
                 and centring
                 and min(turning, default=-1) < centring[-1]
             ):
-                most = f"carried by the turntable ({', '.join(turns)}), as mount_x and mount_y are"
-                raise _refused(f"components.{component.name}.axis", component.axis, most)
+                allowed = (
+                    f"carried by the turntable ({', '.join(turns)}), as mount_x and mount_y are"
+                )
+                raise _refused(f"components.{component.name}.axis", component.axis, allowed)
             twice = next((motor for motor in chain if chain.count(motor) > 1), None)
-            most = "a motor that no part which carries this one has already"
-            _refuse_if(twice is not None, f"components.{component.name}.axis", twice, most)
+            allowed = "a motor that no part which carries this one has already"
+            _refuse_if(twice is not None, f"components.{component.name}.axis", twice, allowed)
 
     def _check_roles(self) -> None:
         """Check that focal spot, active area and holder are where the X-ray geometry has them.
@@ -643,8 +645,10 @@ class Machine(_Frozen):
         ):
             parts = [part for part in self.components if part.role == role]
             if self.components and len(parts) != 1 and role != "sample_mount":
-                most = f"one component with role = {role!r}; or no components and no check at all"
-                raise _refused("components", [part.name for part in parts], most)
+                allowed = (
+                    f"one component with role = {role!r}; or no components and no check at all"
+                )
+                raise _refused("components", [part.name for part in parts], allowed)
             for part in parts:
                 where = f"components.{part.name}"
                 if part.anchor != anchor:
@@ -652,20 +656,20 @@ class Machine(_Frozen):
                 chain = self.chain(part)
                 left = [motor for motor in self._motors_of(anchor) if motor not in chain]
                 if left:
-                    most = (
+                    allowed = (
                         f"carried by every motor that [geometry] gives the {anchor}, so that it "
                         f"goes where the X-ray geometry goes: say axis = {left[0]!r} of it or of "
                         "a part that carries it"
                     )
-                    raise _refused(f"{where}.axis", part.axis, most)
+                    raise _refused(f"{where}.axis", part.axis, allowed)
                 slack = _AREA_SLACK_MM if role == "panel" else 1e-6
-                beside = [abs(c) + r for c, r in zip(part.center_mm, half, strict=False)]
+                reach = [abs(c) + r for c, r in zip(part.center_mm, half, strict=False)]
                 if part.shape == "cylinder":
-                    beside[:2] = [math.hypot(beside[0], beside[1]), 0.0]
-                if any(b > side / 2 + slack for b, side in zip(beside, part.size_mm, strict=False)):
+                    reach[:2] = [math.hypot(reach[0], reach[1]), 0.0]
+                if any(b > side / 2 + slack for b, side in zip(reach, part.size_mm, strict=False)):
                     held = _CONTAINED_PLACES[role]
-                    most = f"such that the {part.shape}, {part.size_mm} mm, holds {held}"
-                    raise _refused(f"{where}.center_mm", part.center_mm, most)
+                    allowed = f"such that the {part.shape}, {part.size_mm} mm, holds {held}"
+                    raise _refused(f"{where}.center_mm", part.center_mm, allowed)
 
     def _on_turntable(self, motor: str) -> bool:
         """Return whether a motor moves a stage that turns with the sample."""
@@ -755,9 +759,9 @@ def parse_machine(text: str, file: str = "<machine>", corners: Corners | None = 
     idle = [name for name in machine.axes if name not in driving]
     if idle or not machine.geometry.get("angle"):
         path = f"axes.{idle[0]}" if idle else "geometry.angle"
-        most = "in [geometry] with what it moves" if idle else "motors that turn the sample"
+        allowed = "in [geometry] with what it moves" if idle else "motors that turn the sample"
         raise MachineFileError(
-            f"{file}: {path}: must be {most}; {NOT_MODELLED}", {"file": file, "path": path}
+            f"{file}: {path}: must be {allowed}; {NOT_MODELLED}", {"file": file, "path": path}
         )
     return machine
 
@@ -866,16 +870,16 @@ def _meshed(own: Raw, corners: Corners | None) -> Raw:
     for part in meshed:
         where = f"components.{part.get('name')}"
         name = part["mesh"]
-        said = [key for key in ("shape", "size_mm", "center_mm", "points_mm") if key in part]
-        if said:
-            raise UnknownNameError(f"{where}.{said[0]}: must be left out: the mesh says it")
+        keys = [key for key in ("shape", "size_mm", "center_mm", "points_mm") if key in part]
+        if keys:
+            raise UnknownNameError(f"{where}.{keys[0]}: must be left out: the mesh says it")
         at = part.get("mesh_at_mm", (0.0, 0.0, 0.0))
         number = lambda v: isinstance(v, (int, float)) and not isinstance(v, bool)  # noqa: E731
         if not isinstance(at, Sequence) or len(at) != 3 or not all(map(number, at)):
             raise UnknownNameError(f"{where}.mesh_at_mm: must be three numbers (value: {at!r})")
         if not isinstance(name, str) or corners is None:
-            most = "a file's name" if corners else "left out: no files are read here"
-            raise UnknownNameError(f"{where}.mesh: must be {most} (value: {name!r})")
+            allowed = "a file's name" if corners else "left out: no files are read here"
+            raise UnknownNameError(f"{where}.mesh: must be {allowed} (value: {name!r})")
         try:
             found = corners(name)
         except TwinError as error:
@@ -910,12 +914,12 @@ def _inherited(own: Raw) -> Raw:
         if key == "components" and not all(isinstance(part, dict) for part in parts):
             raise UnknownNameError(f"components must be tables, [[components]] (value: {value!r})")
         if isinstance(base.get(key), dict) and not isinstance(value, dict):
-            most = f"must be a table, [{key}]{_limit(key)}"
-            raise UnknownNameError(f"{key} {most} (value: {value!r})")
+            allowed = f"must be a table, [{key}]{_limit(key)}"
+            raise UnknownNameError(f"{key} {allowed} (value: {value!r})")
     if "name" in own:
         base["default_profile"] = ""  # the base's zero offsets are of that machine alone
-    for gone in without if isinstance(without, list) else [without]:
-        _drop(base, gone)
+    for removed in without if isinstance(without, list) else [without]:
+        _drop(base, removed)
     return _merged(base, own)
 
 
@@ -945,13 +949,13 @@ def _drop(base: Raw, name: object) -> None:
         entry["moves"].pop(name, None)
         if entry["of"] == name:
             del axes[1][virtual]
-    gone = next((c for c in parts if c["name"] == name), {})
+    removed = next((c for c in parts if c["name"] == name), {})
     for part in parts:
         if part.get("axis") == name:
             del part["axis"]
         if "parent" in part and part["parent"] == name:
             part.pop("parent")
-            part.update({k: gone[k] for k in ("parent",) if k in gone})
+            part.update({k: removed[k] for k in ("parent",) if k in removed})
     base["components"] = [c for c in parts if c["name"] != name]
     pairs = base.get("allowed_contacts", [])
     base["allowed_contacts"] = [pair for pair in pairs if name not in pair]
@@ -989,8 +993,8 @@ def _merged_parts(old: list[Raw], own: list[Raw]) -> list[Raw]:
 def _credit(merged: Raw, old: Raw, own: Raw) -> None:
     """Write into `source` which values come from this file and which from the base."""
     if own and isinstance(old.get("source"), str) and "source" not in own:
-        said = ", ".join(key for key in own if key != "name")
-        merged["source"] = f"{said}: this file; else {old['source'] or 'as the base has it'}"
+        keys = ", ".join(key for key in own if key != "name")
+        merged["source"] = f"{keys}: this file; else {old['source'] or 'as the base has it'}"
 
 
 def _parse(model: type[_M], prepared: Callable[[Raw], Raw], text: str, file: str) -> _M:
@@ -1026,20 +1030,20 @@ def _parse(model: type[_M], prepared: Callable[[Raw], Raw], text: str, file: str
                 data.append({"path": path, "message": "is missing"})
                 continue
             value = e["input"] if at is None else e["ctx"]["value"]
-            said = "there is no such key" if e["type"] == "extra_forbidden" else message_of(e)
+            message = "there is no such key" if e["type"] == "extra_forbidden" else message_of(e)
             if e["type"] in ("extra_forbidden", "literal_error", "model_type"):
-                said += _limit(path)
-            lines.append(f"{file}: {path}: {said} (value: {value!r})")
-            data.append({"path": path, "message": said, "value": repr(value)})
+                message += _limit(path)
+            lines.append(f"{file}: {path}: {message} (value: {value!r})")
+            data.append({"path": path, "message": message, "value": repr(value)})
         raise MachineFileError("\n".join(lines), {"file": file, "problems": data}) from None
 
 
 def _limit(path: str) -> str:
     """Return the limitation by docs/limits.md of a key, to end an error with, or ""."""
     last = path.rpartition(".")[2].lower()
-    said = next((text for key, text in _KEY_LIMITS.items() if last.startswith(key)), None)
-    if said:
-        return f"; {said} (docs/limits.md)"
+    limit = next((text for key, text in _KEY_LIMITS.items() if last.startswith(key)), None)
+    if limit:
+        return f"; {limit} (docs/limits.md)"
     return ""
 
 

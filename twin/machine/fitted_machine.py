@@ -38,11 +38,11 @@ def fitted_text(
         TOML.
     """
     blocks = {f"axes.{name}": _axis_table(name, machine.axes[name]) for name in axes}
-    made = _replaced(text, {**blocks, "timing": _timing_table(machine.timing)})
-    if parse(made, "fitted machine") != machine:
+    new_text = _replaced(text, {**blocks, "timing": _timing_table(machine.timing)})
+    if parse(new_text, "fitted machine") != machine:
         what = "the base machine's file must write axes as tables [axes.NAME] and times as [timing]"
         raise MachineFileError(what, {"allowed": ["[axes.NAME]", "[timing]"]})
-    return made
+    return new_text
 
 
 def _replaced(text: str, blocks: Mapping[str, str]) -> str:
@@ -90,8 +90,8 @@ def _timing_table(timing: Timing) -> str:
         kind = line.split("_s = ")[0]
         found = timing.spread.get(kind)
         measured = found is not None or kind.startswith("drift")
-        told = "" if kind.startswith("source") else "measured, log" if measured else "assumed"
-        lines.append(line + (f"  # {told}" if told else ""))
+        origin = "" if kind.startswith("source") else "measured, log" if measured else "assumed"
+        lines.append(line + (f"  # {origin}" if origin else ""))
     lines += ["", "[timing.spread]"]
     for kind, spread in timing.spread.items():
         inner = ", ".join(f"{key} = {value!r}" for key, value in spread.model_dump().items())

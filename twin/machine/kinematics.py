@@ -222,21 +222,21 @@ def _too_far(
     """
     if axis in machine.axes:
         return error
-    here = virtual_reading(machine, axis, positions)
+    reading = virtual_reading(machine, axis, positions)
     ends = []
     for motor, factor in machine.moves(axis).items():
         a = machine.axes[motor]
         left = (a.lower - positions[motor], a.upper - positions[motor])
-        ends.append(sorted(here + way / factor for way in left))
+        ends.append(sorted(reading + way / factor for way in left))
     low = max(low for low, _ in ends)
     high = min(high for _, high in ends)
-    target = here + value if relative else value
+    target = reading + value if relative else value
     unit = error.data["unit"]
-    said = (
+    message = (
         f"{axis} target {target:g} {unit} is outside [{low:g}, {high:g}] {unit}, "
         f"which is how far its motors go from here: {error}"
     )
-    return LimitError.of_axis(said, axis, target, [low, high], str(unit))
+    return LimitError.of_axis(message, axis, target, [low, high], str(unit))
 
 
 @dataclass(frozen=True)

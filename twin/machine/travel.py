@@ -58,17 +58,17 @@ def arrival(machine: Machine, axis: str, targets: Mapping[str, float]) -> Arriva
         axis: motor or virtual axis that is moved.
         targets: motor -> requested target [mm, deg].
     """
-    told = []
+    messages = []
     beyond = None
     for motor, target in targets.items():
         left = _distance_beyond(machine, motor, target)
         if left <= POSITION_ROUNDING:
             continue
         error = _outside(machine, motor, target)
-        told.append(error.message)
+        messages.append(error.message)
         if not left <= machine.axes[motor].arrival_tolerance + POSITION_ROUNDING:
             beyond = beyond or error
-    return Arrival(clamp(machine, targets, axis), tuple(told), beyond)
+    return Arrival(clamp(machine, targets, axis), tuple(messages), beyond)
 
 
 def rate(machine: Machine, axis: str, what: Rate, value: float) -> Arrival:
@@ -82,18 +82,18 @@ def rate(machine: Machine, axis: str, what: Rate, value: float) -> Arrival:
         value: of the axis [mm or deg, per s or s2].
     """
     motors = {}
-    told = []
+    messages = []
     beyond = None
     for motor, share in machine.moves(axis).items():
         a = machine.axes[motor]
-        asked = value * abs(share)
-        most = a.max_speed if what == "speed" else a.max_acceleration
-        if not asked <= most * (1.0 + POSITION_ROUNDING):  # as one that is no number
+        requested = value * abs(share)
+        limit = a.max_speed if what == "speed" else a.max_acceleration
+        if not requested <= limit * (1.0 + POSITION_ROUNDING):  # as one that is no number
             unit = f"{a.unit}/{'s' if what == 'speed' else 's2'}"
-            told.append(f"{motor} {what} {asked:g} {unit} is above {most:g} {unit}")
-            beyond = beyond or LimitError.of_axis(told[-1], motor, asked, most, unit)
-        motors[motor] = min(asked, most)
-    return Arrival(motors, tuple(told), beyond)
+            messages.append(f"{motor} {what} {requested:g} {unit} is above {limit:g} {unit}")
+            beyond = beyond or LimitError.of_axis(messages[-1], motor, requested, limit, unit)
+        motors[motor] = min(requested, limit)
+    return Arrival(motors, tuple(messages), beyond)
 
 
 def check_target(machine: Machine, axis: str, value: float) -> float:
@@ -136,5 +136,5 @@ def _distance_beyond(machine: Machine, motor: str, target: float) -> float:
 def _outside(machine: Machine, motor: str, target: float) -> LimitError:
     """Make the error for a target outside the travel."""
     a = machine.axes[motor]
-    said = f"{motor} target {target:g} {a.unit} is outside [{a.lower:g}, {a.upper:g}] {a.unit}"
-    return LimitError.of_axis(said, motor, target, [a.lower, a.upper], a.unit)
+    message = f"{motor} target {target:g} {a.unit} is outside [{a.lower:g}, {a.upper:g}] {a.unit}"
+    return LimitError.of_axis(message, motor, target, [a.lower, a.upper], a.unit)

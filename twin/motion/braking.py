@@ -300,8 +300,8 @@ def _along(drive: Drive, cells: list[_Cell], now: float) -> Trajectory:
         left = cell.rate - cell.slowing * cell.length
         x = leg.position(cell.programme)
         v = velocity * cell.rate
-        gone = ds * (velocity + 0.5 * acceleration * ds)
-        reached = x + gone
+        distance = ds * (velocity + 0.5 * acceleration * ds)
+        reached = x + distance
         arrives = (velocity + acceleration * ds) * max(0.0, left)
         if not pieces and cell.start > now:
             pieces.append(Piece(now, x, 0.0, 0.0))
@@ -317,7 +317,7 @@ def _along(drive: Drive, cells: list[_Cell], now: float) -> Trajectory:
             # Not `reached - x`: its rounding, over a short length twice, would put motors that run
             # in step out of it.
             gained = arrives - v
-            moved = gone - v * length
+            moved = distance - v * length
             first = 4.0 * moved / length**2 - gained / length
             second = 3.0 * gained / length - 4.0 * moved / length**2
             pieces.append(Piece(cell.start, x, v, first))

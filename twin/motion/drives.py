@@ -187,8 +187,8 @@ def plan_jog(
     limit, name = min((machine.axes[n].max_speed / abs(f), n) for n, f in moves.items())
     if not abs(velocity) <= limit:
         unit = machine.axes[name].unit
-        said = f"jog of {axis} at {velocity:g} {unit}/s: {name} allows {limit:g} {unit}/s"
-        raise LimitError.of_axis(said, axis, str(velocity), limit, f"{unit}/s")
+        message = f"jog of {axis} at {velocity:g} {unit}/s: {name} allows {limit:g} {unit}/s"
+        raise LimitError.of_axis(message, axis, str(velocity), limit, f"{unit}/s")
 
     def run(name: str, lease: float) -> Trajectory:
         """Plan a motor's share: it runs for `lease` [s], or as far as its limit."""
@@ -238,11 +238,11 @@ def with_settings(
     """
     out = dict(drives)
     shares = {name: abs(factor) for name, factor in machine.moves(axis).items()}
-    asked: tuple[tuple[Rate, float | None], ...] = (
+    settings: tuple[tuple[Rate, float | None], ...] = (
         ("speed", speed),
         ("acceleration", acceleration),
     )
-    for what, value in asked:
+    for what, value in settings:
         if value is None:
             continue
         above = rate(machine, axis, what, value).told

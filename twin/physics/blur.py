@@ -82,9 +82,9 @@ def blurred(
     """
     across = sigma_px if across_px is None else across_px
     if not (widest := max(sigma_px, across)) <= MAX_SIGMA_PX:
-        said = f"a blur of {widest:.3g} pixels (standard deviation)"
+        message = f"a blur of {widest:.3g} pixels (standard deviation)"
         cure = "a smaller focal spot, less power, less magnification or larger pixels"
-        raise LimitError.instead(said, widest, f"{MAX_SIGMA_PX:g}, by {cure}")
+        raise LimitError.instead(message, widest, f"{MAX_SIGMA_PX:g}, by {cure}")
     if widest < MIN_SIGMA_PX:
         return image
     import cv2

@@ -248,7 +248,7 @@ def radiographs(
         moments: views spread over each exposure.
         scatter: of each image; none if left out.
     """
-    made = []
+    images = []
     for i, given in enumerate(exposures):
         exposure = replace(given, xrays_on=True)
         part = slice(i * moments, (i + 1) * moments)
@@ -256,8 +256,8 @@ def radiographs(
         expected = expected_signal(chain, paths_mm[:, part], view, exposure)
         if scatter:
             expected = scatter[i].added_to(expected, chain, view, exposure)
-        made.append(Radiograph(_as_line_integrals(chain, expected, view, exposure), expected))
-    return made
+        images.append(Radiograph(_as_line_integrals(chain, expected, view, exposure), expected))
+    return images
 
 
 def _as_line_integrals(

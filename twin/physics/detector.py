@@ -203,8 +203,10 @@ class Detector:
         """
         pitch = pixels.pitch_mm
         if self.pixel_mm is not None and abs(self.pixel_mm - pitch) > 1e-6 * pitch:
-            said = f"the detector's pixel_mm is {self.pixel_mm:g} mm, the geometry's {pitch:g} mm"
-            raise LimitError.instead(said, self.pixel_mm, pitch, unit="mm")
+            message = (
+                f"the detector's pixel_mm is {self.pixel_mm:g} mm, the geometry's {pitch:g} mm"
+            )
+            raise LimitError.instead(message, self.pixel_mm, pitch, unit="mm")
         across, up = pixels.edges_mm
         # In pixels of the twin as it is usually read out, binned 2 x.
         area = across * up / (2 * PixelGrid.pitch_mm) ** 2
@@ -391,7 +393,7 @@ def pattern(panel: Detector, binning: int, roi: tuple[int, int, int, int]) -> Pa
         return mean
 
     living = blocks(alive.astype(np.float32))
-    made = Pattern(blocks(gain * alive), blocks(offset), living < 0.5)
-    for array in (made.gain, made.offset, made.dead):
+    drawn = Pattern(blocks(gain * alive), blocks(offset), living < 0.5)
+    for array in (drawn.gain, drawn.offset, drawn.dead):
         array.flags.writeable = False
-    return made
+    return drawn

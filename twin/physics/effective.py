@@ -107,8 +107,8 @@ def effective_beam(
         Energies whose signal is within the tolerance on thicknesses that were not fitted.
     """
     if not signal.max() > 0.0:
-        said = "no photon leaves anything in the detector"
-        raise LimitError.instead(said, 0.0, "one that absorbs some of the spectrum")
+        message = "no photon leaves anything in the detector"
+        raise LimitError.instead(message, 0.0, "one that absorbs some of the spectrum")
     used = np.flatnonzero(signal > signal.max() * 1e-9)
     mu = np.array([s.attenuation()[used] for s in substances]).reshape(len(substances), len(used))
     paths = sample_paths(mu, signal[used], thickest_mm)
@@ -170,21 +170,23 @@ def sample_paths(
     random = np.random.default_rng([m, seed])
     rows = [np.zeros((1, m))]
     opaque = np.log(1e6 * len(signal)) / np.maximum(mu.min(axis=1, initial=np.inf), 1e-12)
-    most = np.minimum(np.maximum(np.asarray(thickest_mm, dtype=np.float64), 1e-6), opaque)
-    least = np.minimum(MIN_OPTICAL_DEPTH / np.maximum(mu.max(axis=1, initial=0.0), 1e-12), most / 2)
+    limit = np.minimum(np.maximum(np.asarray(thickest_mm, dtype=np.float64), 1e-6), opaque)
+    least = np.minimum(
+        MIN_OPTICAL_DEPTH / np.maximum(mu.max(axis=1, initial=0.0), 1e-12), limit / 2
+    )
     for i in range(m):
         n = 60 * more
         even = (np.arange(n) + random.uniform(size=n)) / (n - 1)
         part = np.minimum(even, 1.0)
-        alone = np.zeros((2 * n, m))
-        alone[:n, i] = least[i] * (most[i] / least[i]) ** part
-        alone[n:, i] = most[i] * part**2
-        rows.append(alone)
+        single = np.zeros((2 * n, m))
+        single[:n, i] = least[i] * (limit[i] / least[i]) ** part
+        single[n:, i] = limit[i] * part**2
+        rows.append(single)
     if m > 1:
         part = random.uniform(size=(200 * m * more, m))
-        there = random.uniform(size=part.shape) < 0.7
-        rows.append(least * (most / least) ** part * there)
-        rows.append(most * random.uniform(size=part.shape) ** 2)
+        present = random.uniform(size=part.shape) < 0.7
+        rows.append(least * (limit / least) ** part * present)
+        rows.append(limit * random.uniform(size=part.shape) ** 2)
     return np.concatenate(rows)
 
 
@@ -194,9 +196,9 @@ def _relative(
     """Compute each energy's contribution behind `paths`, (j, e), and their sum, (j,),
     over that sum."""
     columns = np.exp(-paths @ mu) * weights
-    whole = columns.sum(axis=1)
-    scale = 1.0 / np.maximum(whole, MIN_TRANSMISSION * weights.sum())
-    return columns * scale[:, None], whole * scale
+    total = columns.sum(axis=1)
+    scale = 1.0 / np.maximum(total, MIN_TRANSMISSION * weights.sum())
+    return columns * scale[:, None], total * scale
 
 
 def _pursue(

@@ -144,8 +144,8 @@ def pixel_variance(
     kept = _kept_by_blur(panel.blur_px(camera))
     electrons = 0.0
     for term in NOISE:
-        own = term.variance_e2(panel, camera, xrays_e2)
-        electrons += own * kept if term.spreads else own
+        term_e2 = term.variance_e2(panel, camera, xrays_e2)
+        electrons += term_e2 * kept if term.spreads else term_e2
     return electrons / averages / panel.gain(camera) ** 2 + ROUNDING_COUNTS2
 
 

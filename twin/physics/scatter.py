@@ -222,8 +222,8 @@ def scatter_image(
     away = nodes - source
     distance = np.linalg.norm(away, axis=1)
     per_open = distance**3 / (away @ normal)
-    there = bool(thing.substances) and thing.amounts.any()
-    lit = _lit(thing, row, shape, wanted.collimated) if there else (0.0, 0.0, 0.0, 0.0)
+    occupied = bool(thing.substances) and thing.amounts.any()
+    lit = _lit(thing, row, shape, wanted.collimated) if occupied else (0.0, 0.0, 0.0, 0.0)
     left, top, right, bottom = lit
     corner = centre + left * u + top * v
     along_u = (right - left) * u
@@ -352,8 +352,10 @@ def _lit(
     normal = np.cross(u, v)
     depth = (corners - source) @ normal / ((centre - source) @ normal)
     if depth.min() <= 1e-3:
-        said = "the X-ray source lies in or beside the sample's box: its scatter is not simulated"
-        raise GeometryError.instead(said, source.tolist(), "a sample in front of the source")
+        message = (
+            "the X-ray source lies in or beside the sample's box: its scatter is not simulated"
+        )
+        raise GeometryError.instead(message, source.tolist(), "a sample in front of the source")
     on_panel = source + (corners - source) / depth[:, None] - centre
     plane = np.linalg.lstsq(np.stack([u, v], axis=1), on_panel.T, rcond=None)[0]
     low = plane.min(axis=1)

@@ -90,8 +90,8 @@ def deposited(screen: Filter) -> Deposited:
     square = kept * energy
     for symbol, part in substance.fractions:
         edge, jump, fluorescence, lines = K_SHELL.get(symbol, (np.inf, 0.0, 0.0, (0.0, 0.0)))
-        alone = Substance(symbol, ((symbol, 1.0),), part * substance.density_g_cm3)
-        amount = jump * fluorescence * photo * alone.attenuation() / total * (energy > edge)
+        element = Substance(symbol, ((symbol, 1.0),), part * substance.density_g_cm3)
+        amount = jump * fluorescence * photo * element.attenuation() / total * (energy > edge)
         for line, often in zip(lines, (K_ALPHA_SHARE, 1.0 - K_ALPHA_SHARE), strict=True):
             lost = escaping(np.interp([line], energy, stopping))
             escapes = amount * often * (here * lost).sum(axis=1)
@@ -106,7 +106,7 @@ def deposited(screen: Filter) -> Deposited:
         met = compton * energy * ring[:, j]
         kept += met * (here.sum(axis=1) - k[:, j] * lost)
         square += met * energy * (here.sum(axis=1) - k[:, j] * (2.0 - k[:, j]) * lost)
-    made = Deposited(kept / energy, square / energy**2)
-    for array in made:
+    result = Deposited(kept / energy, square / energy**2)
+    for array in result:
         array.flags.writeable = False
-    return made
+    return result

@@ -164,8 +164,8 @@ def tube_spectrum(kV: float, tube: TubeModel | None = None) -> Spectrum:
     behind = Spectrum(bare).behind(*layers)
     if not behind.photons > MIN_PHOTONS:
         names = ", ".join(f"{one.thickness_mm:g} mm of {one.substance.name}" for one in layers)
-        said = f"at {kV:g} kV nothing comes through the tube's filters ({names})"
-        raise LimitError.instead(said, kV, "thinner filters or a higher voltage")
+        message = f"at {kV:g} kV nothing comes through the tube's filters ({names})"
+        raise LimitError.instead(message, kV, "thinner filters or a higher voltage")
     return behind
 
 

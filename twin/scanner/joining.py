@@ -252,11 +252,11 @@ class Lookahead:
     def _new_halt_swept(self, new: Trajectories, contact: Contact) -> dict[str, Trajectory] | None:
         """Slow `new` by itself as late as possible while the others carry on."""
 
-        alone = {name: self.drives[name] for name in new}
+        new_drives = {name: self.drives[name] for name in new}
 
         def halted(at: float) -> dict[str, Trajectory]:
             """Brake the new motors from `at` on."""
-            return _trajectories(braked_at(alone, at, new, self.hardest), new)
+            return _trajectories(braked_at(new_drives, at, new, self.hardest), new)
 
         def free(at: float) -> bool:
             """Return whether that is free of contacts."""
@@ -326,24 +326,24 @@ class Lookahead:
         Returns:
             Motor -> trajectory; None where nothing is quicker and free.
         """
-        whole = max((t.end for t in along.values()), default=self.now) - self.now
+        duration = max((t.end for t in along.values()), default=self.now) - self.now
         due = [n for n, d in self.drives.items() if d.end > self.now]
         strongest = {
             name: greatest(name, d.at(self.now), self.now, most) for name, d in self.drives.items()
         }
         slowed = {name: self.drives[name].following(t) for name, t in along.items()}
         for share in QUICKER_STOP_SHARES:
-            at = self.now + share * whole
+            at = self.now + share * duration
             drives = slowed if share else self.drives
-            apart = braked_apart(self.machine, drives, at, strongest)
-            if max((t.end for t in apart.values()), default=at) > self.now + whole - MIN_GAIN_S:
+            stops = braked_apart(self.machine, drives, at, strongest)
+            if max((t.end for t in stops.values()), default=at) > self.now + duration - MIN_GAIN_S:
                 return None
-            trajectories = {n: motion.rejoined(along[n], at, rest) for n, rest in apart.items()}
+            trajectories = {n: motion.rejoined(along[n], at, rest) for n, rest in stops.items()}
             # The one motor that has anything to do brakes on the path that it was swept
             # on. Where another is to set off later, it may rely on the room that one
             # would make.
-            alone = not share and len(due) == 1
-            free = alone or self.contact({**along, **trajectories}, since=at) is None
+            single = not share and len(due) == 1
+            free = single or self.contact({**along, **trajectories}, since=at) is None
             if free and self._within_travel(trajectories):
                 return {**along, **trajectories}
         return None

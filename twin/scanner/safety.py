@@ -179,10 +179,10 @@ def in_contact(safety: Safety, pair: tuple[str, str] | None) -> Safety:
         if safety.contact is None:
             return safety
         reason = "parts were in contact and have come apart"
-        apart = replace(safety, contact=None)
+        separated = replace(safety, contact=None)
         if safety.state == "estopped":
-            return apart
-        return replace(apart, reason=reason)
+            return separated
+        return replace(separated, reason=reason)
     touching = replace(safety, contact=pair)
     if safety.state == "estopped":
         return touching
@@ -208,17 +208,17 @@ def collision_error(
     where = ", ".join(f"{axis} {value:.4g}" for axis, value in halts_at.items())
     outcome = f"motion halts at {where}" if where else "nothing changes"
     count = safety.blocked_attempts
-    most = safety.max_blocked_attempts
+    allowed = safety.max_blocked_attempts
     return would_touch(
         what,
         contact.pair,
         ahead,
         contact.last_free,
         "are too close already",
-        f"{outcome} (blocked attempt {count} of {most})",
+        f"{outcome} (blocked attempt {count} of {allowed})",
         halts_at=dict(halts_at),
         blocked_attempts=count,
-        max_blocked_attempts=most,
+        max_blocked_attempts=allowed,
         state=safety.state,
     )
 

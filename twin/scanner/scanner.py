@@ -311,7 +311,7 @@ class ScannerTwin:
             )
             for axis, value in targets.items()
         )
-        return [f"{said}; set to the limit" for each in found for said in each.told]
+        return [f"{message}; set to the limit" for each in found for message in each.told]
 
     def jog(self, axis: str, velocity: float, lease_s: float, now: float) -> JogMotion:
         """Run `axis` at `velocity` until the lease ends or a limit nears, then brake.

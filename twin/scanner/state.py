@@ -345,8 +345,8 @@ def changed_camera(
     spec.check_mode(new.mode)
     check_roi(new.roi, spec.pixels, new.binning)
     least = spec.min_exposure_ms
-    most = spec.max_exposure_ms
-    _require_within("camera", "exposure_ms", new.exposure_ms, least, most)
+    longest = spec.max_exposure_ms
+    _require_within("camera", "exposure_ms", new.exposure_ms, least, longest)
     _require_within("camera", "averages", new.averages, 1, 10_000)
     _require_within("camera", "frames", new.frames, 1, 1_000_000)
     return new

@@ -479,12 +479,12 @@ def _check_counts(request: _Request) -> None:
         ("sod_mm", request.sod_mm, 1e-3, request.sdd_mm),
         *(("placements", x, -1e6, 1e6) for p in request.placements for x in vars(p).values()),
     )
-    for name, value, least, most in rules:
-        if not (math.isfinite(value) and least <= value <= most):
-            what = f"{name} is {value:g}; allowed: {least:g} to {most:g}"
-            if name == "sod_mm" and value > most:
+    for name, value, low, high in rules:
+        if not (math.isfinite(value) and low <= value <= high):
+            what = f"{name} is {value:g}; allowed: {low:g} to {high:g}"
+            if name == "sod_mm" and value > high:
                 what += ", the sdd_mm: are the two swapped?"
-            raise LimitError(what, {"setting": name, "asked": value, "allowed": [least, most]})
+            raise LimitError(what, {"setting": name, "asked": value, "allowed": [low, high]})
 
 
 def _row(component: str, command: str, first: str = "", second: str = "", wait: str = "ACK") -> str:

@@ -91,20 +91,20 @@ def read_log(data: bytes) -> tuple[tuple[Executed, ...], tuple[ScriptProblem, ..
         >>> line.own_s, type(line.command).__name__, found
         (0.501, 'XrayOff', ())
     """
-    made: list[Executed] = []
+    executed: list[Executed] = []
     problems: list[ScriptProblem] = []
     number = 0
     start = 0
     for number, stamp in enumerate(LOG_STAMP.finditer(data), 1):
         try:
-            made.append(_line(data[start : stamp.start()], stamp, number, problems))
+            executed.append(_line(data[start : stamp.start()], stamp, number, problems))
         except ArgumentError as error:
             problems.append(ScriptProblem("error", error.code, number, 1, str(error)))
         start = stamp.end()
     if data[start:].strip(b"\0 \t\r\n\x1a"):
         what = f"the last line is cut off before its moment and left out; {COLUMNS}"
         problems.append(ScriptProblem("warning", "cut_off", number + 1, 1, what))
-    return tuple(made), in_order(problems)
+    return tuple(executed), in_order(problems)
 
 
 def _line(
@@ -204,7 +204,7 @@ def motor_cluster(motor: MotorReply) -> bytes:
         (True, 267)
     """
     m = motor
-    made = bytearray(_REPLY_BYTES)
+    cluster = bytearray(_REPLY_BYTES)
     head = (
         m.position,
         m.target,
@@ -218,9 +218,9 @@ def motor_cluster(motor: MotorReply) -> bytes:
         0.0,
         m.max_acceleration,
     )
-    struct.pack_into(f">{len(head)}d", made, 0, *head)
-    struct.pack_into(">2d", made, _LIMITS_COPY_BYTE, m.upper, m.lower)
-    return bytes(made)
+    struct.pack_into(f">{len(head)}d", cluster, 0, *head)
+    struct.pack_into(">2d", cluster, _LIMITS_COPY_BYTE, m.upper, m.lower)
+    return bytes(cluster)
 
 
 def motor_reply(reply: bytes) -> MotorReply | None:

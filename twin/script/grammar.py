@@ -91,8 +91,8 @@ def number(text: str, what: str, index: int = 0) -> float:
     value = float(text) if _NUMBER.fullmatch(text) else math.nan
     if not math.isfinite(value):
         hint = "; decimals are written with a point" if "," in text else ""
-        asked = f"{shorten(text)!r} is not a number" if text else "it is missing"
-        raise ArgumentError(f"{what} must be a number: {asked}{hint}", index=index)
+        problem = f"{shorten(text)!r} is not a number" if text else "it is missing"
+        raise ArgumentError(f"{what} must be a number: {problem}{hint}", index=index)
     if abs(value) > MAX_NUMBER:
         raise ArgumentError(f"{what} {shorten(text)} is beyond {MAX_NUMBER:g}", index=index)
     return value

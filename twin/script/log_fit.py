@@ -255,8 +255,8 @@ def fit_machine(logs: Sequence[Log], base: Machine, source: str) -> Fit:
     commands = [x.command for log in logs for x in log]
     axes = dict(base.axes)
     for name, found in replies.items():
-        own = [k for k in commands if _axis_of(k, base) == name]
-        axes[name] = _axis(base.axes[name], found, own)
+        of_axis = [k for k in commands if _axis_of(k, base) == name]
+        axes[name] = _axis(base.axes[name], found, of_axis)
     start = base.timing.model_copy(update={"spread": {}, "sequence_overhead_s": None})
     machine = base.model_copy(update={"axes": axes, "timing": start})
     samples: dict[str, tuple[float, ...]] = {}
@@ -362,9 +362,9 @@ def _axis(axis: Axis, replies: Sequence[MotorReply], own: Collection[c.Command])
         replies: of its motor, oldest first; at least one.
         own: the commands to this axis.
     """
-    most = mode((r.lower, r.upper, r.max_speed, r.max_acceleration) for r in replies)
-    agree = [r for r in replies if (r.lower, r.upper, r.max_speed, r.max_acceleration) == most]
-    lower, upper, max_speed, max_acceleration = most
+    common = mode((r.lower, r.upper, r.max_speed, r.max_acceleration) for r in replies)
+    agree = [r for r in replies if (r.lower, r.upper, r.max_speed, r.max_acceleration) == common]
+    lower, upper, max_speed, max_acceleration = common
     last = agree[-1]
     of = "" if len(agree) == len(replies) else f" of {len(replies)}"
     set_speed, set_acceleration = (

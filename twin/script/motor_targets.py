@@ -94,10 +94,10 @@ class MotorTargets:
         geometry = self.machine.geometry
         moved = (motor for quantity in wanted for motor in geometry.get(quantity, {}))
         out = {motor: self.machine.axis(motor).home for motor in moved}
-        for quantity, asked in wanted.items():
+        for quantity, value in wanted.items():
             if motor := self.drivers.get(quantity):
                 rest = self.value(quantity, {motor: 0.0})
-                out[motor] = round((asked - rest) / geometry[quantity][motor], 6)
+                out[motor] = round((value - rest) / geometry[quantity][motor], 6)
         return out
 
     def driver(self, quantity: str) -> str:

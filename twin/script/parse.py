@@ -262,16 +262,16 @@ def read_script(text: Source) -> tuple[c.Script, tuple[ScriptProblem, ...]]:
             "and `flexdt check SCRIPT --against` it compares; to run, a script has seven columns"
         )
         return c.Script((), (), 0), (ScriptProblem("error", "executed_log", 0, 1, what),)
-    made: list[c.Command] = []
+    commands: list[c.Command] = []
     for row in rows(text):
         command = read_row(row, problems)
         if command is not None:
-            made.append(command)
-    if not made and not problems:
+            commands.append(command)
+    if not commands and not problems:
         problems.append(ScriptProblem("error", "syntax", 0, 1, "the script holds no command"))
     ordered = in_order(problems)
     warnings = tuple(p for p in ordered if p.severity == "warning")
-    return c.Script(tuple(made), warnings, line_count(text)), ordered
+    return c.Script(tuple(commands), warnings, line_count(text)), ordered
 
 
 def read_row(row: CodeLine, problems: list[ScriptProblem]) -> c.Command | None:
@@ -458,9 +458,9 @@ class _Line:
         name = self.component.text
         if len(fields) < 2 or _CUSTOM_NAME.fullmatch(name) is None:
             return False
-        own = nearest_name(name, (*grammar.FIXED,))
+        nearest = nearest_name(name, (*grammar.FIXED,))
         words = [word.text for field in fields[:5] for word in _split(field)]
-        if own is not None and grammar.match(own, words) is not None:
+        if nearest is not None and grammar.match(nearest, words) is not None:
             return False
         return any(_find_wait(_split(f), 0)[1] for f in fields) or bool(_find_wait(fields, 0)[1])
 

@@ -62,8 +62,8 @@ class ScriptError(TwinError):
         errors = [p for p in self.problems if p.severity == "error"]
         count = f"{len(errors)} error{'s' if len(errors) != 1 else ''}"
         text = "\n".join(str(p) for p in errors)
-        told = [p.to_dict() for p in self.problems]
-        super().__init__(f"the script has {count}:\n{text}", {"problems": told})
+        documents = [p.to_dict() for p in self.problems]
+        super().__init__(f"the script has {count}:\n{text}", {"problems": documents})
 
 
 class Findings:

@@ -94,9 +94,9 @@ class Optics:
             "turn_field_mm": "full_turn_diameter_mm",
             "truncation": "truncation_px",
         }
-        told = {n: list(v) if isinstance(v, tuple) else v for n, v in vars(self).items()}
-        told["rows"], told["cols"] = told.pop("shape")
-        return {names.get(name, name): value for name, value in told.items()}
+        document = {n: list(v) if isinstance(v, tuple) else v for n, v in vars(self).items()}
+        document["rows"], document["cols"] = document.pop("shape")
+        return {names.get(name, name): value for name, value in document.items()}
 
 
 @dataclass(frozen=True)

@@ -296,7 +296,7 @@ class ImageCollector:
         self.moved = self.motors.moving(start)
         lit = tube.lit(start)
         moving = bool(self.moved)
-        made = ExposureGroup(
+        group = ExposureGroup(
             kind,
             files,
             starts,
@@ -310,8 +310,8 @@ class ImageCollector:
             exact or {},
         )
         self.last = len(self.images)
-        self.images.append(made)
-        return made
+        self.images.append(group)
+        return group
 
     # fly scans -----------------------------------------------------------------------------
 

@@ -82,10 +82,10 @@ class Motor:
     def move(self, target: float, time: float, speed: float, acceleration: float) -> Trajectory:
         """Start a move to `target` at `time`, from the current position and velocity."""
         v = self.moves[-1][1].velocity(time) if self.moves else 0.0
-        made = motion.move(self.position(time), v, target, speed, acceleration, time)
-        if made.end > time:
-            self.moves.append((time, made))
-        return made
+        trajectory = motion.move(self.position(time), v, target, speed, acceleration, time)
+        if trajectory.end > time:
+            self.moves.append((time, trajectory))
+        return trajectory
 
 
 class Motors:

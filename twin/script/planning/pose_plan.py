@@ -89,11 +89,11 @@ def plan_poses(
         c.SetVoltage(kV=begin.kV),
         c.SetPower(power_W=begin.power_W),
     ]
-    told: list[ScriptProblem] = []
+    problems: list[ScriptProblem] = []
     back: Sequence[Pose] = ()
     references = [*_image("di000000.tif"), c.XrayOn(), c.WaitXrayReady()]
     if flat is False or not poses:
-        told = [ScriptProblem("warning", "no_flat", 0, 1, _NO_FLAT)]
+        problems = [ScriptProblem("warning", "no_flat", 0, 1, _NO_FLAT)]
     else:
         first = _arrival(begin.positions, poses[0], machine, begin)
         if flat is True:
@@ -105,7 +105,7 @@ def plan_poses(
         ways = ((place, _legs(begin.positions, place, route)) for place in places)
         place, out = next((way for way in ways if way[1] is not None), (places[0], None))
         if out is None:
-            told = [ScriptProblem("warning", "flat_path", 0, 1, _NO_PATH)]
+            problems = [ScriptProblem("warning", "flat_path", 0, 1, _NO_PATH)]
             out = _legs(begin.positions, place) or ()
         back = _legs(place, first, route) or _legs(place, first) or ()
         for leg in (*out, asked):
@@ -122,7 +122,7 @@ def plan_poses(
         commands += _image(f"scan_{i:06d}.tif", line)
     commands.append(c.XrayOff(line=len(poses)))
     plan = plan_script(c.Script.of(commands), machine, profile, start=begin, sample=sample)
-    return replace(plan, problems=in_order((*told, *plan.problems)))
+    return replace(plan, problems=in_order((*problems, *plan.problems)))
 
 
 def _image(file: str, line: int = 0) -> list[c.Command]:

@@ -132,8 +132,8 @@ def _predicted(
         doubt = open_beam_doubt(plan.machine, lit, beam)
         made = replace(made, open_beam_fill=beam.fill, doubts=() if doubt is None else (doubt,))
         known = "saturated" if beam.saturated else "starved" if beam.starved else ""
-    told = [text for name, text in _sentences(seen) if name != known]
-    return replace(made, doubts=(*made.doubts, *told))
+    doubts = [text for name, text in _sentences(seen) if name != known]
+    return replace(made, doubts=(*made.doubts, *doubts))
 
 
 def sample_problems(

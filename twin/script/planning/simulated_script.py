@@ -296,14 +296,14 @@ class Simulation:
             if found.told and target != asked[motor]:
                 note += f" (limited to {motor} {target:g} {self.machine.axes[motor].unit})"
         begin = {m: self.motors.all[m].position(self.now) for m in targets}
-        made = {
+        trajectories = {
             m: self.motors.all[m].move(targets[m], self.now, *rate)
             for m, rate in self.motors.rates(name).items()
         }
-        end = max(t.end for t in made.values())
+        end = max(t.end for t in trajectories.values())
         release = None
         if command.wait is c.Wait.POS and command.trigger is not None:
-            release = self._pass(command, command.trigger, made, begin, end)
+            release = self._pass(command, command.trigger, trajectories, begin, end)
         if command.wait is not c.Wait.ACK:
             return planned.Span(self.now, end, release=release, note=note)
         kind = "move" if end > self.now else "move_standing"
