@@ -4,7 +4,7 @@
 
 An ellipsoid with a hole and two inclusions: line integrals of the analytic solids, with noise.
 Prints one line a case: views, noise, and the rms error [1/mm] of FDK, SIRT and TV with each weight.
-The table in docs/operator.md is this.
+docs/evidence/reconstruction.json has the table.
 """
 
 from __future__ import annotations

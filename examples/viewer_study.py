@@ -1,4 +1,4 @@
-"""What the browser gets: rates at the socket, images displayed, latency, memory (docs/viewer.md).
+"""Measure what the browser gets: rates, latency, memory (docs/evidence/viewer.json).
 
     python examples/viewer_study.py                   # rates and latency, about a minute
     python examples/viewer_study.py --minutes 30      # and memory under half an hour of motion

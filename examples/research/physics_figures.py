@@ -1,4 +1,4 @@
-"""The figures of docs/physics.md and docs/reconstruction.md that need no peer, measured anew.
+"""Measure the figures of docs/evidence/physics.json and reconstruction.json that need no peer.
 
 python examples/research/physics_figures.py
 """

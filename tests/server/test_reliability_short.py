@@ -44,7 +44,7 @@ def test_absurd_values_in_every_field(tmp_path: Path) -> None:
 
 @pytest.mark.campaign
 def test_attacks_get_nothing() -> None:
-    """All but those that take long: see docs/reliability.md for the whole list."""
+    """All but those that take long: see docs/evidence/reliability.json for the whole list."""
     out = run("attacks.py", *QUICK)
     assert f"{len(QUICK)} of {len(QUICK)} attacks failed; 0 unhandled exceptions" in out
 

@@ -11,7 +11,7 @@ memory  a volume of four times the address space (`ulimit -v`) that each process
 
 All is compared with what one undisturbed worker made. Exit code 1 when anything differs or
 is lost. --views, --panel ROWS,COLS and --side choose the scan and the volume's voxels a side; the
-default, which the figures in docs/reconstruction.md say, is 360 views of 380 x 478 into 256.
+default, that of docs/evidence/reconstruction.json, is 360 views of 380 x 478 into 256.
 Processes are started and judged from outside; the scan alone is made by flexdt.
 """
 
