@@ -398,7 +398,7 @@ def test_names_of_uploads_keep_letters_and_overwrite_nothing(page: Any) -> None:
         ("a:b.stl", ("a-b", "a-b-1")): "a-b-2",
         ("....stl", ("mesh-1", "mesh-2")): "mesh-3",
     }
-    ask = "([file, taken]) => import('/setup.js').then((m) => m.sampleName(file, taken))"
+    ask = "([file, taken]) => import('/names.js').then((m) => m.sampleName(file, taken))"
     for (file, taken), name in named.items():
         assert page.evaluate(ask, [file, list(taken)]) == name
 

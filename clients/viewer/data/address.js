@@ -1,4 +1,5 @@
-// What a reload brings back: tab, view, data set and frame in the address, the script after its #.
+// What a reload brings back: tab, view, data set and frame in the address, the script after its
+// #.
 import { base64 } from "./dom.js";
 const MOST = 6000, DUE_MS = 300, KEY = "flexdt-script"; // a longer script stays in this browser's tab
 export const asked = (name) => new URLSearchParams(location.search).get(name);

@@ -19,7 +19,8 @@ const MAINS = [
         words: "Source to sample",
         unit: "mm",
         digits: 2,
-        tip: "SOD: from the focal spot to the rotation axis, along the beam. Setting it moves the sample.",
+        tip: "SOD: from the focal spot to the rotation axis, along the beam. " +
+            "Setting it moves the sample.",
         now: sod,
         axes: ["mag_obj"],
         shift: (s, v) => v - sod(s),
@@ -46,7 +47,8 @@ const MAINS = [
         words: "Voxel size",
         unit: "µm",
         digits: 2,
-        tip: "A pixel of the image, as large as it is at the sample: pixel / magnification. Setting it moves the sample.",
+        tip: "A pixel of the image, as large as it is at the sample: pixel / magnification. " +
+            "Setting it moves the sample.",
         now: (s) => 1000 * s.geometry.voxel_size_mm,
         axes: ["mag_obj"],
         shift: (s, v) => sod(s) * (v / (1000 * s.geometry.voxel_size_mm) - 1),
@@ -55,7 +57,8 @@ const MAINS = [
         words: "Sample above beam",
         unit: "mm",
         digits: 2,
-        tip: "Height of the sample's reference point above the focal spot. Setting it moves source and detector together.",
+        tip: "Height of the sample's reference point above the focal spot. " +
+            "Setting it moves source and detector together.",
         now: high,
         axes: ["ver_tube", "ver_det"],
         shift: (_, v) => high() - v,
@@ -276,12 +279,11 @@ function pace(state) {
         const all = Object.values(state.axes)
             .filter((a) => a.unit === unit && !a.virtual)
             .map((a) => (a.speed ?? JOG_FALLBACK[unit]) * Number($select("#jog-speed").value));
-        const low = Math.min(...all), high = Math.max(...all);
-        return all.length
-            ? [
-                `${low === high ? fixed(low, 1) : `${fixed(low, 1)} to ${fixed(high, 1)}`} ${unit === "deg" ? "°/s" : "mm/s"}`,
-            ]
-            : [];
+        if (!all.length)
+            return [];
+        const low = fixed(Math.min(...all), 1);
+        const high = fixed(Math.max(...all), 1);
+        return [`${low === high ? low : `${low} to ${high}`} ${unit === "deg" ? "°/s" : "mm/s"}`];
     };
     setText($("#jog-is"), [...of("mm"), ...of("deg")].join(", "));
 }

@@ -1,9 +1,11 @@
-// On an open data set: the recorded image beside the virtual one of its pose, and the beads of a fit over it.
+// On an open data set: the recorded image beside the virtual one of its pose, and the beads of a
+// fit over it.
 import { $, $input, el, fixed, setText } from "./dom.js";
 import { emit, on, store } from "./link.js";
 import * as marks from "./marks.js";
 const AMBER = "#ffb454", GREEN = "#36e28f", BLUE = "#7cc4ff", REACH = 8;
-const tracks = new Map(); // folder -> where a fit of this page found its beads, and put them before and after
+// Folder -> where a fit of this page found its beads, and put them before and after.
+const tracks = new Map();
 const again = () => emit("image", store.image);
 const WAYS = {
     recorded: "recorded",
@@ -76,7 +78,8 @@ export function beside(i, virtual) {
 }
 export function words(i) {
     const way = i?.virtual ? mode.value : "recorded";
-    return `${WAYS[way].replace("curtain: ", "")} · ${i?.recorded ? i.recorded.file : "no image to be shown"}`;
+    const file = i?.recorded ? i.recorded.file : "no image to be shown";
+    return `${WAYS[way].replace("curtain: ", "")} · ${file}`;
 }
 // Dragging the curtain in the picture; `pixel` is a CSS pixel in its coordinates.
 let held = false;

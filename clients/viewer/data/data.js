@@ -1,7 +1,9 @@
-// The Data tab: a browser of data sets; one that is open goes through its images, radiograph and machine together.
+// The Data tab: a browser of data sets; one that is open goes through its images, radiograph and
+// machine together.
 import { $, $$, $button, $dialog, $input, $select, clicks, el, fixed, putImage, seconds, setText, slid, within, words, } from "./dom.js";
 import { call, command, emit, on, store } from "./link.js";
 import { asked, remember } from "./address.js";
+import { differences, ofImage, only, sampleOf } from "./fingerprint.js";
 import { draw as drawTimeline } from "./timeline.js";
 import { offer } from "./share.js";
 import * as compare from "./compare.js";
@@ -34,6 +36,9 @@ const button = (id, text, title, f) => el("button", { id, class: "small", title,
 const panel = el("div", { id: "record", hidden: true }, el("div", { class: "row head" }, el("b", { id: "record-name", class: "cut" }), el("span", { id: "record-state", class: "muted cut" }), el("span", { class: "spacer" }), button("record-fit", "Calibrate", "Calibrate from this data set: its sample is the phantom", () => {
     if (told)
         emit("calibrate", told.info.name, told.info.sample);
+}), button("record-resume", "Resume", "Make the images that are missing", () => {
+    if (told)
+        void resume(told.info.name);
 }), button("record-align", "Align", "Find the axis of this scan without a phantom", () => {
     if (told)
         emit("align", told.info.name);
@@ -85,7 +90,11 @@ function row(info) {
             ? why
             : WORDS[info.state])));
     node.setAttribute("aria-current", String(info.name === told?.info.name));
-    return node;
+    if (info.state !== "incomplete")
+        return [node];
+    const title = `Make the images of ${info.name} that are missing`;
+    const go = { class: "small data-resume", title, onclick: () => resume(info.name) };
+    return [node, el("button", go, `Resume ${info.name}`)];
 }
 async function list(start = 0) {
     const mine = ++number;
@@ -101,8 +110,9 @@ async function list(start = 0) {
     }
     listed = [...(start ? listed : []), ...answer.datasets];
     const key = JSON.stringify(listed);
+    // A click is lost with its row.
     if (key !== drawn)
-        $("#data-list").replaceChildren(...listed.map(row)); // a click is lost with its row
+        $("#data-list").replaceChildren(...listed.flatMap(row));
     drawn = key;
     $button("#data-more").hidden = listed.length >= answer.total;
     const left = answer.left_out ? ` · ${answer.left_out} folders left out` : "";
@@ -128,6 +138,21 @@ on("session", () => {
     if (!$("#tab-data").hidden)
         void list();
 });
+// The images of a data set that are missing: by its job, or by its script under the same name.
+async function resume(name) {
+    const none = `${name} does not go on`;
+    const all = await command("job.list", {}, none);
+    if (!all)
+        return;
+    const job = all.jobs.findLast((each) => folder(each) === name);
+    if (job) {
+        await command("job.resume", { job: job.job }, none);
+        return;
+    }
+    const data = await command("dataset.get", { name, points: 2, script: true }, none);
+    if (data?.script)
+        await command("script.submit", { text: data.script, name }, none);
+}
 export const folder = (job) => (job?.dataset ?? "").split(/[\\/]/).pop() || "?";
 on("job", (job) => {
     if (!$("#tab-data").hidden)
@@ -165,9 +190,16 @@ export async function open(name, at = null, step = false) {
         return;
     const i = told.info, bare = !told.times_s;
     setText($("#record-name"), i.name);
-    setText($("#record-state"), `${WORDS[i.state]}${i.problem || i.reason ? `: ${i.problem || i.reason}` : ""} · ${settings(i)}${i.duration_s ? ` · ${seconds(i.duration_s)}` : ""}`);
+    setText($("#record-state"), [
+        [WORDS[i.state], i.problem || i.reason].filter(Boolean).join(": "),
+        settings(i),
+        i.duration_s ? seconds(i.duration_s) : "",
+    ]
+        .filter(Boolean)
+        .join(" · "));
     $("#record-state").title = $("#record-state").textContent;
     compare.allow(told.same_machine ? "" : "not this twin’s machine and zeros, or poses that are not known");
+    $button("#record-resume").hidden = i.state !== "incomplete";
     $button("#record-replay").disabled = bare || !told.same_machine;
     slider.max = String(Math.max(0, told.images - 1));
     setText($("#record-note"), note());
@@ -181,6 +213,22 @@ export async function open(name, at = null, step = false) {
     lanes();
 }
 let opening = 0;
+// What the virtual image that is shown was made of; null where there is none.
+function virtualMade() {
+    const origin = store.image?.recorded?.virtual_origin;
+    return origin ? only(ofImage(origin, null, ""), "sample", "placement", "correction") : null;
+}
+function virtualWords(scanned) {
+    const made = virtualMade();
+    if (!made)
+        return "";
+    const name = sampleOf(made);
+    const shown = name === "empty" ? "empty stage" : name;
+    const other = name === scanned ? "" : ` (the scan says ${scanned || "nothing of its sample"})`;
+    const { correction } = made;
+    const geometry = typeof correction === "string" ? `correction ${correction}` : "nominal geometry";
+    return `virtual: ${shown}${other}, ${geometry}`;
+}
 function note() {
     if (!told)
         return "";
@@ -190,11 +238,7 @@ function note() {
     else if (!told.same_machine)
         parts.push("another machine or other zeros than this twin's: its pose is not drawn in the scene");
     if (compare.how() !== "recorded") {
-        const { sample, correction } = store.state ?? {};
-        const other = sample?.name === told.info.sample
-            ? ""
-            : ` (the scan says ${told.info.sample || "nothing of its sample"})`;
-        parts.push(`virtual: ${sample?.name || "empty stage"}${other}, ${correction ? `correction ${correction.name}` : "nominal geometry"}`);
+        parts.push(virtualWords(told.info.sample));
     }
     if (told.clearance_of)
         parts.push(`clearance: ${told.clearance_of}`);
@@ -258,7 +302,8 @@ async function show(wanted) {
     while (next !== null && still(name)) {
         const at = next, kinds = told.whole ?? told, k = kinds.indices.indexOf(at);
         next = null;
-        // Dark and flat images have no line integrals; of an image between those told the answer says what it is.
+        // Dark and flat images have no line integrals; of an image between those told the answer says
+        // what it is.
         const kind = k >= 0 && kinds.kinds[k] !== "projection" ? "counts" : kindAsked();
         let about = null, why = "";
         try {
@@ -329,20 +374,30 @@ async function script() {
     if (answer?.script)
         emit("script", answer.script);
 }
-// The virtual image goes with what the twin has in force.
-let force = "";
+// The virtual image goes with what the twin has in force: made anew once for each change of that.
+let askedFor = "";
 const anew = () => {
-    if (told) {
-        setText($("#record-note"), note());
-        void show(index);
-    }
+    if (!told)
+        return;
+    setText($("#record-note"), note());
+    void show(index);
 };
 on("compare", anew);
-on("state", ({ sample, correction }) => {
-    const now = JSON.stringify([sample, correction?.name]);
-    if (now !== force && told && compare.how() !== "recorded")
-        anew();
-    force = now;
+on("image", () => {
+    if (told)
+        setText($("#record-note"), note());
+});
+on("state", () => {
+    const made = virtualMade();
+    if (!made || !store.now || compare.how() === "recorded")
+        return;
+    if (!differences(made, store.now).length)
+        return;
+    const key = JSON.stringify(only(store.now, "sample", "placement", "correction"));
+    if (key === askedFor)
+        return;
+    askedFor = key;
+    anew();
 });
 slid(canvas, (part) => {
     void play(false);
@@ -369,8 +424,9 @@ window.addEventListener("keydown", (e) => {
         return;
     void open(null, null, true);
 });
-// A viewer that was started again knows nothing of it; a page that was loaded again asks for what its address
-// names: once the viewer has seen the twin, and this page has its own connection to it.
+// A viewer that was started again knows nothing of it; a page that was loaded again asks for what
+// its address names: once the viewer has seen the twin, and this page has its own connection to
+// it.
 let lost = false, first = true, seen = false;
 function ready() {
     if (!seen || !store.session)

@@ -49,8 +49,8 @@ export function pressed(f) {
         },
     };
 }
-// A field for a number (as text: browsers drop what they cannot read from number fields without a word).
-// What is typed is marked until Enter applies it or Escape takes it back.
+// A field for a number (as text: browsers drop what they cannot read from number fields without a
+// word). What is typed is marked until Enter applies it or Escape takes it back.
 export function field(attributes, apply, back) {
     return numeric(el("input", {
         type: "text",
@@ -101,7 +101,8 @@ export function base64(buffer) {
 }
 // A canvas's pixels in two dimensions, and one that was not refused.
 export function context2d(canvas) {
-    const context = canvas.getContext("2d", { willReadFrequently: true }); // images are made, and read back, by the processor
+    // Images are made, and read back, by the processor.
+    const context = canvas.getContext("2d", { willReadFrequently: true });
     if (!context)
         throw new Error("this browser draws nothing");
     return context;
@@ -172,11 +173,13 @@ export function chosen(input, take) {
         input.value = "";
     });
 }
-// A term that explains itself where it stands: under the pointer, when tapped, and when the keyboard comes to it.
+// A term that explains itself where it stands: under the pointer, when tapped, and when the
+// keyboard comes to it.
 export const term = (words, tip) => el("button", { type: "button", class: "term", "aria-description": tip, "data-tip": tip }, words);
 // What went wrong, in words.
 export const words = (error) => error instanceof Error ? error.message : String(error);
-// The element of a kind that an event happened within; elements of other frames are of other classes.
+// The element of a kind that an event happened within; elements of other frames are of other
+// classes.
 export const within = (target, selector) => target?.closest?.(selector) ?? null;
 // Keeps a choice in this browser, if it has room.
 export function keep(key, value) {

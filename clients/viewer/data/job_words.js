@@ -1,5 +1,5 @@
-// What is said of a scan: its state, who ended it, how long it takes, and what stands elsewhere than
-// where it began.
+// What is said of a scan: its state, who ended it, how long it takes, and what stands elsewhere
+// than where it began.
 import { fixed, isNumber, seconds } from "./figures.js";
 const FINAL = ["done", "failed", "aborted", "incomplete"];
 const MOVED = 0.01; // mm or degrees

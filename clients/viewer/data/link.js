@@ -1,5 +1,5 @@
-// The page's connection to its viewer: requests with answers, newest states and images, how old they are,
-// reconnection.
+// The page's connection to its viewer: requests with answers, newest states and images, how old
+// they are, reconnection.
 import { keep, words } from "./dom.js";
 import { differences, ofData, ofImage, ofNow, } from "./fingerprint.js";
 export const pageId = (window.pageId = [...crypto.getRandomValues(new Uint8Array(12))]
@@ -30,7 +30,8 @@ export const store = {
     coneVec: null,
     cameras: null,
 };
-// Older than OLD_S, what is shown is said to be old; after SILENT_S nobody waits for answers any more.
+// Older than OLD_S, what is shown is said to be old; after SILENT_S nobody waits for answers any
+// more.
 export const OLD_S = 1;
 const SILENT_S = Number(new URLSearchParams(location.search).get("patience") ?? 5), LOOK_MS = 200, STOOD_MS = 1000, REST_MS = 500, TRY_AGAIN = 1013;
 const listeners = {};
@@ -82,7 +83,8 @@ export function rename(name) {
     socket?.close();
 }
 export function connect() {
-    socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws/${pageId}?person=${encodeURIComponent(person())}`);
+    const scheme = location.protocol === "https:" ? "wss" : "ws";
+    socket = new WebSocket(`${scheme}://${location.host}/ws/${pageId}?person=${encodeURIComponent(person())}`);
     socket.binaryType = "arraybuffer";
     socket.onopen = () => {
         store.viewer = true;
@@ -185,9 +187,9 @@ function text(content) {
     if (m.type in handlers)
         handlers[m.type](m);
 }
-// How old what is shown is: since the last heartbeat of the viewer, what that one took, and how long the twin
-// has told the viewer nothing. Of the two clocks' difference the least one seen stands for no delay; it may
-// grow by the error of clocks.
+// How old what is shown is: since the last heartbeat of the viewer, what that one took, and how
+// long the twin has told the viewer nothing. Of the two clocks' difference the least one seen
+// stands for no delay; it may grow by the error of clocks.
 const DRIFT = 1e-4;
 let heard = null, least = null;
 function late(sent) {
@@ -219,8 +221,8 @@ function look() {
         apart && differs !== null ? (now - Math.max(differs, apart.at_ms)) / 1000 : 0;
     emit("age");
 }
-// A page that itself stood still (much to draw, a laptop asleep) first reads what has come meanwhile, before it
-// says that the viewer is silent.
+// A page that itself stood still (much to draw, a laptop asleep) first reads what has come
+// meanwhile, before it says that the viewer is silent.
 let looked = performance.now(), woken = -Infinity;
 const rested = () => performance.now() - looked < STOOD_MS && performance.now() - woken > REST_MS;
 setInterval(() => {

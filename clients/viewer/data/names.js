@@ -6,8 +6,8 @@ const SHOWN_INSTEAD = "\ufffd";
 const FORBIDDEN = /[\u0000-\u001f\u007f/\\:*?"<>|]+/g;
 const NAME_LENGTH = 100;
 export const plain = (text) => text.replace(DIRECTION_MARKS, SHOWN_INSTEAD);
-// The file's name without what names may not hold; neutral where nothing is left of it. A name that
-// had to be changed is never one that is taken, so nothing is overwritten by accident.
+// The file's name without what names may not hold; neutral where nothing is left of it. A name
+// that had to be changed is never one that is taken, so nothing is overwritten by accident.
 export function sampleName(file, taken) {
     const bare = file.replace(/\.[^.]*$/, "").normalize("NFC");
     const allowed = bare.replace(DIRECTION_MARKS, "").replace(FORBIDDEN, "-");

@@ -1,4 +1,5 @@
-// The scan in the bar: how far it is, what it waits for or who ended it, and what can be done now.
+// The scan in the bar: how far it is, what it waits for or who ended it, and what can be done
+// now.
 import { $, $button, clicks, setText } from "./dom.js";
 import { command, emit, on, store } from "./link.js";
 import { isOver, isUnfinished, moved, progress, stateWords, timeLeft, whatWords, } from "./job_words.js";

@@ -4,8 +4,8 @@ import { isOver } from "./job_words.js";
 import { on, store } from "./link.js";
 const MAX_THUMBS = 40;
 const WIDTH_PX = 124;
-// The last image may come a little after the scan's end, by our clock, or be of a little after it,
-// by the twin's.
+// The last image may come a little after the scan's end, by our clock, or be of a little after
+// it, by the twin's.
 const LATE_S = 1.5;
 let lastThumb = -1;
 let lastImage = 0;

@@ -62,7 +62,8 @@ async function catchUp() {
     else
         forget(); // a twin that knows nothing of it
 }
-// A page that was just opened, or a twin that was started again: the last scan, if it is unfinished.
+// A page that was just opened, or a twin that was started again: the last scan, if it is
+// unfinished.
 on("session", async () => {
     const status = await call("job.status").catch(() => null);
     if (status && !store.job && isUnfinished(status))

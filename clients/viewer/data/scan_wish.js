@@ -1,5 +1,5 @@
-// What the next scan is wished to be: each quantity stands once, and has one field. The designer and
-// the script both read it here.
+// What the next scan is wished to be: each quantity stands once, and has one field. The designer
+// and the script both read it here.
 import { $input, $select } from "./dom.js";
 import { batch, computed, effect, signal } from "./signals.js";
 import { on } from "./link.js";

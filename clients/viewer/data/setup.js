@@ -1,9 +1,7 @@
 // The Setup tab: tube, camera, sample on the stage (with upload), layers of the scene.
-import { $, $$, $button, $canvas, $input, $select, base64, cleared, clicks, el, fixed, keep, numeric, parsed, setText, words, } from "./dom.js";
+import { $, $$, $button, $canvas, $input, $select, cleared, clicks, el, fixed, keep, numeric, parsed, setText, words, } from "./dom.js";
 import { differences, listed, only } from "./fingerprint.js";
 import { call, command, emit, on, store } from "./link.js";
-const CHUNK = 3 << 20;
-const FORMATS = ["stl", "obj", "ply", "glb", "off"];
 const ROI = ["l", "t", "r", "b"], SIX = ["x", "y", "z", "rx", "ry", "rz"];
 // What is set here and not yet applied bears the class "typed"; everything else shows the state.
 for (const input of $$("#tab-setup .num")) {
@@ -26,7 +24,6 @@ clicks({
     "sample-apply": setSample,
     "sample-delete": deleteSample,
     predict,
-    "mesh-upload": sendMesh,
     beam: () => command("tube.set", { on: !store.state?.tube.on }, "The tube refuses"),
 });
 // A field or a list of these.
@@ -57,13 +54,14 @@ function numbers(...ids) {
     takeBack(...wrong);
     return wrong.length ? null : values;
 }
-// The fields in which nobody has typed anything else since: an answer may come late, and is theirs alone.
+// The fields in which nobody has typed anything else since: an answer may come late, and is
+// theirs alone.
 function untouched(ids) {
     const sent = ids.map((id) => of(id).value);
     return () => ids.filter((id, i) => of(id).value === sent[i]);
 }
-// Sends what was typed into `fields` (parameter -> field or fields) as one command; after an error
-// the fields show the state again.
+// Sends what was typed into `fields` (parameter -> field or fields) as one command; after an
+// error the fields show the state again.
 async function apply(method, fields, title) {
     const params = {}, ids = Object.values(fields).flat();
     for (const [name, its] of Object.entries(fields)) {
@@ -109,75 +107,6 @@ async function setSample() {
     for (const warning of answer?.warnings ?? [])
         emit("note", "warning-note", "Sample", warning);
 }
-// The file's name without what names may not hold; neutral where nothing is left of it. A name that
-// had to be changed is never one that is taken, so nothing is overwritten by accident.
-export function sampleName(file, taken) {
-    const bare = file.replace(/\.[^.]*$/, "").normalize("NFC");
-    const name = bare
-        .replace(/[\u0000-\u001f\u007f/\\:*?"<>|]+/g, "-")
-        .replace(/^[\s.-]+|[\s.-]+$/g, "")
-        .slice(0, 100);
-    const stem = name || "mesh";
-    if (name === bare || (name && !taken.includes(name)))
-        return name;
-    let n = 1;
-    while (taken.includes(`${stem}-${n}`))
-        n++;
-    return `${stem}-${n}`;
-}
-export async function sendMesh() {
-    const file = $input("#mesh-file").files?.[0], note = $("#mesh-note");
-    if (!file) {
-        emit("note", "warning-note", "Upload", "choose a file first");
-        return;
-    }
-    const format = FORMATS.find((f) => f === formatOf(file));
-    if (!format) {
-        emit("note", "error", "Upload", `${file.name}: allowed are ${FORMATS.join(", ")}`);
-        return;
-    }
-    if (!file.size) {
-        emit("note", "error", "Upload", `${file.name} is empty`);
-        return;
-    }
-    const known = await command("sample.list", {}, "No upload");
-    if (!known)
-        return;
-    const name = sampleName(file.name, known.samples.map((s) => s.name)), total = file.size;
-    const common = {
-        name,
-        format,
-        total,
-        unit: $select("#mesh-unit").value,
-        material: $select("#mesh-material").value || null,
-    };
-    let answer = null;
-    for (let start = 0; start < total; start += CHUNK) {
-        note.textContent = `${Math.round((100 * start) / total)} %`;
-        const data = base64(await file.slice(start, start + CHUNK).arrayBuffer());
-        answer = await command("sample.upload", { ...common, start, data }, `${file.name} was not taken`);
-        if (answer === null) {
-            note.textContent = "";
-            return;
-        }
-        for (const warning of answer.warnings ?? [])
-            emit("note", "warning-note", name, warning);
-    }
-    note.textContent = answer?.complete ? "uploaded" : "";
-    if (!answer?.complete) {
-        emit("note", "error", "Upload", `${file.name} did not arrive as a whole`);
-        return;
-    }
-    await list();
-    if (await command("sample.set", { name }, "The sample stays"))
-        emit("note", "good", "Sample", `${name} is on the stage`);
-}
-const formatOf = (file) => (file.name.split(".").pop() ?? "").toLowerCase();
-$input("#mesh-file").addEventListener("change", () => {
-    const file = $input("#mesh-file").files?.[0];
-    if (file)
-        $select("#mesh-unit").value = formatOf(file) === "glb" ? "m" : "mm";
-});
 // Uploads that can be deleted: the twin says why one that is in use stays.
 let uploads = [];
 const deletable = () => {
@@ -214,9 +143,13 @@ export async function list() {
 }
 // What the physics that the twin was started with makes of voltage and filters.
 const PHYSICS = {
-    ideal: "Voltage does nothing to the line integrals here: one attenuation for each material. It makes counts brighter, as power and exposure do. Start the twin with --physics poly for spectra.",
-    mono: "Photons of one energy, as many as the spectrum below would make visible: voltage changes brightness and noise, not contrast.",
-    poly: "Photons of all energies below, through the filters: voltage changes contrast, brightness and noise.",
+    ideal: "Voltage does nothing to the line integrals here: one attenuation for each material. " +
+        "It makes counts brighter, as power and exposure do. " +
+        "Start the twin with --physics poly for spectra.",
+    mono: "Photons of one energy, as many as the spectrum below would make visible: " +
+        "voltage changes brightness and noise, not contrast.",
+    poly: "Photons of all energies below, through the filters: " +
+        "voltage changes contrast, brightness and noise.",
 };
 // What a prediction is made of; it goes with that.
 const predictable = () => store.now ? only(store.now, "twin", "machine", "sample", "tube", "camera", "distances") : {};
@@ -292,6 +225,7 @@ on("session", () => {
 });
 let listedFor;
 on("session", list);
+on("samples", list);
 on("state", show);
 function show(state) {
     outdatePrediction();
@@ -332,7 +266,8 @@ on("open", () => {
     if (seen)
         call("viewer.layers", JSON.parse(seen)).catch(() => { });
 });
-// A box keeps what was chosen last until the viewer has answered: states that it sent before that are older.
+// A box keeps what was chosen last until the viewer has answered: states that it sent before that
+// are older.
 const choosing = new Map();
 async function showLayer(name, visible) {
     choosing.set(name, (choosing.get(name) ?? 0) + 1);

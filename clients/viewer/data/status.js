@@ -1,4 +1,5 @@
-// Bar and notes: whether everything is there, who holds control, stops and resets, what went wrong.
+// Bar and notes: whether everything is there, who holds control, stops and resets, what went
+// wrong.
 import { $, $$, $button, $dialog, $input, el, fixed, setText } from "./dom.js";
 import { listed, sampleOf } from "./fingerprint.js";
 import { command, imageMade, OLD_S, on, person, rename, store } from "./link.js";
@@ -75,7 +76,8 @@ export async function estop() {
         pressed = null;
 }
 $button("#estop").addEventListener("click", () => void estop());
-// A reset releases the one stop that the page shows, and not before a person has had time to see it.
+// A reset releases the one stop that the page shows, and not before a person has had time to see
+// it.
 const SEEN_MS = 1000;
 let shown = null;
 function release(s) {
@@ -113,7 +115,8 @@ const BUTTON = "the machine's own emergency stop button is the one that counts";
 $button("#stop").addEventListener("click", () => void command("axes.stop", {}, "Stop"));
 const GREETING_S = 3;
 const BACK = "the page comes back by itself";
-const LATE = "viewer or twin do not answer, or the network is slow; what is done here may come late or not at all";
+const LATE = "viewer or twin do not answer, or the network is slow; " +
+    "what is done here may come late or not at all";
 function missing() {
     if (store.refused) {
         const title = "The viewer does not serve this page now";
@@ -140,8 +143,8 @@ function missing() {
     }
     return null;
 }
-// A page that was just opened greets with "connecting": what is not there yet is missing only after
-// GREETING_S. A viewer that refuses the page is told at once.
+// A page that was just opened greets with "connecting": what is not there yet is missing only
+// after GREETING_S. A viewer that refuses the page is told at once.
 let greeting = true;
 function greets(found) {
     const arrived = found === null && store.state !== null;

@@ -1,4 +1,5 @@
-// What a reload brings back: tab, view, data set and frame in the address, the script after its #.
+// What a reload brings back: tab, view, data set and frame in the address, the script after its
+// #.
 import { base64 } from "./dom.js";
 
 const MOST = 6000,

@@ -33,7 +33,8 @@ interface Row {
   asked: number;
   waiting: number;
 }
-// What a scan is planned by; setting one moves motors by as much. Only a machine with all of them has it.
+// What a scan is planned by; setting one moves motors by as much. Only a machine with all of them
+// has it.
 interface Main {
   words: string;
   unit: string;
@@ -51,7 +52,9 @@ const MAINS: Main[] = [
     words: "Source to sample",
     unit: "mm",
     digits: 2,
-    tip: "SOD: from the focal spot to the rotation axis, along the beam. Setting it moves the sample.",
+    tip:
+      "SOD: from the focal spot to the rotation axis, along the beam. " +
+      "Setting it moves the sample.",
     now: sod,
     axes: ["mag_obj"],
     shift: (s, v) => v - sod(s),
@@ -78,7 +81,9 @@ const MAINS: Main[] = [
     words: "Voxel size",
     unit: "µm",
     digits: 2,
-    tip: "A pixel of the image, as large as it is at the sample: pixel / magnification. Setting it moves the sample.",
+    tip:
+      "A pixel of the image, as large as it is at the sample: pixel / magnification. " +
+      "Setting it moves the sample.",
     now: (s) => 1000 * s.geometry.voxel_size_mm,
     axes: ["mag_obj"],
     shift: (s, v) => sod(s) * (v / (1000 * s.geometry.voxel_size_mm) - 1),
@@ -87,7 +92,9 @@ const MAINS: Main[] = [
     words: "Sample above beam",
     unit: "mm",
     digits: 2,
-    tip: "Height of the sample's reference point above the focal spot. Setting it moves source and detector together.",
+    tip:
+      "Height of the sample's reference point above the focal spot. " +
+      "Setting it moves source and detector together.",
     now: high,
     axes: ["ver_tube", "ver_det"],
     shift: (_, v) => high() - v,
@@ -346,13 +353,10 @@ function pace(state: State) {
     const all = Object.values(state.axes)
       .filter((a) => a.unit === unit && !a.virtual)
       .map((a) => (a.speed ?? JOG_FALLBACK[unit]) * Number($select("#jog-speed").value));
-    const low = Math.min(...all),
-      high = Math.max(...all);
-    return all.length
-      ? [
-          `${low === high ? fixed(low, 1) : `${fixed(low, 1)} to ${fixed(high, 1)}`} ${unit === "deg" ? "°/s" : "mm/s"}`,
-        ]
-      : [];
+    if (!all.length) return [];
+    const low = fixed(Math.min(...all), 1);
+    const high = fixed(Math.max(...all), 1);
+    return [`${low === high ? low : `${low} to ${high}`} ${unit === "deg" ? "°/s" : "mm/s"}`];
   };
   setText($("#jog-is"), [...of("mm"), ...of("deg")].join(", "));
 }

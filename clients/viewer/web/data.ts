@@ -1,4 +1,5 @@
-// The Data tab: a browser of data sets; one that is open goes through its images, radiograph and machine together.
+// The Data tab: a browser of data sets; one that is open goes through its images, radiograph and
+// machine together.
 import {
   $,
   $$,
@@ -18,6 +19,7 @@ import {
 } from "./dom.js";
 import { call, command, emit, on, store } from "./link.js";
 import { asked, remember } from "./address.js";
+import { differences, ofImage, only, sampleOf, type Fingerprint } from "./fingerprint.js";
 import type {
   AboutImage,
   DatasetInfo,
@@ -88,6 +90,9 @@ const panel = el(
         if (told) emit("calibrate", told.info.name, told.info.sample);
       },
     ),
+    button("record-resume", "Resume", "Make the images that are missing", () => {
+      if (told) void resume(told.info.name);
+    }),
     button("record-align", "Align", "Find the axis of this scan without a phantom", () => {
       if (told) emit("align", told.info.name);
     }),
@@ -182,7 +187,10 @@ function row(info: DatasetInfo) {
     ),
   );
   node.setAttribute("aria-current", String(info.name === told?.info.name));
-  return node;
+  if (info.state !== "incomplete") return [node];
+  const title = `Make the images of ${info.name} that are missing`;
+  const go = { class: "small data-resume", title, onclick: () => resume(info.name) };
+  return [node, el("button", go, `Resume ${info.name}`)];
 }
 async function list(start = 0) {
   const mine = ++number;
@@ -197,7 +205,8 @@ async function list(start = 0) {
   }
   listed = [...(start ? listed : []), ...answer.datasets];
   const key = JSON.stringify(listed);
-  if (key !== drawn) $("#data-list").replaceChildren(...listed.map(row)); // a click is lost with its row
+  // A click is lost with its row.
+  if (key !== drawn) $("#data-list").replaceChildren(...listed.flatMap(row));
   drawn = key;
   $button("#data-more").hidden = listed.length >= answer.total;
   const left = answer.left_out ? ` · ${answer.left_out} folders left out` : "";
@@ -225,6 +234,19 @@ on("tab", (tab) => {
 on("session", () => {
   if (!$("#tab-data").hidden) void list();
 });
+// The images of a data set that are missing: by its job, or by its script under the same name.
+async function resume(name: string): Promise<void> {
+  const none = `${name} does not go on`;
+  const all = await command("job.list", {}, none);
+  if (!all) return;
+  const job = all.jobs.findLast((each) => folder(each) === name);
+  if (job) {
+    await command("job.resume", { job: job.job }, none);
+    return;
+  }
+  const data = await command("dataset.get", { name, points: 2, script: true }, none);
+  if (data?.script) await command("script.submit", { text: data.script, name }, none);
+}
 export const folder = (job: JobStatus | null): string =>
   (job?.dataset ?? "").split(/[\\/]/).pop() || "?";
 on("job", (job) => {
@@ -271,12 +293,19 @@ export async function open(
   setText($("#record-name"), i.name);
   setText(
     $("#record-state"),
-    `${WORDS[i.state]}${i.problem || i.reason ? `: ${i.problem || i.reason}` : ""} · ${settings(i)}${i.duration_s ? ` · ${seconds(i.duration_s)}` : ""}`,
+    [
+      [WORDS[i.state], i.problem || i.reason].filter(Boolean).join(": "),
+      settings(i),
+      i.duration_s ? seconds(i.duration_s) : "",
+    ]
+      .filter(Boolean)
+      .join(" · "),
   );
   $("#record-state").title = $("#record-state").textContent;
   compare.allow(
     told.same_machine ? "" : "not this twin’s machine and zeros, or poses that are not known",
   );
+  $button("#record-resume").hidden = i.state !== "incomplete";
   $button("#record-replay").disabled = bare || !told.same_machine;
   slider.max = String(Math.max(0, told.images - 1));
   setText($("#record-note"), note());
@@ -291,6 +320,23 @@ export async function open(
   lanes();
 }
 let opening = 0;
+// What the virtual image that is shown was made of; null where there is none.
+function virtualMade(): Fingerprint | null {
+  const origin = store.image?.recorded?.virtual_origin;
+  return origin ? only(ofImage(origin, null, ""), "sample", "placement", "correction") : null;
+}
+function virtualWords(scanned: string): string {
+  const made = virtualMade();
+  if (!made) return "";
+  const name = sampleOf(made);
+  const shown = name === "empty" ? "empty stage" : name;
+  const other =
+    name === scanned ? "" : ` (the scan says ${scanned || "nothing of its sample"})`;
+  const { correction } = made;
+  const geometry =
+    typeof correction === "string" ? `correction ${correction}` : "nominal geometry";
+  return `virtual: ${shown}${other}, ${geometry}`;
+}
 function note() {
   if (!told) return "";
   const parts: string[] = [];
@@ -301,14 +347,7 @@ function note() {
       "another machine or other zeros than this twin's: its pose is not drawn in the scene",
     );
   if (compare.how() !== "recorded") {
-    const { sample, correction } = store.state ?? {};
-    const other =
-      sample?.name === told.info.sample
-        ? ""
-        : ` (the scan says ${told.info.sample || "nothing of its sample"})`;
-    parts.push(
-      `virtual: ${sample?.name || "empty stage"}${other}, ${correction ? `correction ${correction.name}` : "nominal geometry"}`,
-    );
+    parts.push(virtualWords(told.info.sample));
   }
   if (told.clearance_of) parts.push(`clearance: ${told.clearance_of}`);
   parts.push(
@@ -378,7 +417,8 @@ async function show(wanted: number) {
       kinds: DatasetResult = told.whole ?? told,
       k = kinds.indices.indexOf(at);
     next = null;
-    // Dark and flat images have no line integrals; of an image between those told the answer says what it is.
+    // Dark and flat images have no line integrals; of an image between those told the answer says
+    // what it is.
     const kind = k >= 0 && kinds.kinds[k] !== "projection" ? "counts" : kindAsked();
     let about: AboutImage | null = null,
       why = "";
@@ -453,19 +493,25 @@ async function script() {
   );
   if (answer?.script) emit("script", answer.script);
 }
-// The virtual image goes with what the twin has in force.
-let force = "";
+// The virtual image goes with what the twin has in force: made anew once for each change of that.
+let askedFor = "";
 const anew = () => {
-  if (told) {
-    setText($("#record-note"), note());
-    void show(index);
-  }
+  if (!told) return;
+  setText($("#record-note"), note());
+  void show(index);
 };
 on("compare", anew);
-on("state", ({ sample, correction }) => {
-  const now = JSON.stringify([sample, correction?.name]);
-  if (now !== force && told && compare.how() !== "recorded") anew();
-  force = now;
+on("image", () => {
+  if (told) setText($("#record-note"), note());
+});
+on("state", () => {
+  const made = virtualMade();
+  if (!made || !store.now || compare.how() === "recorded") return;
+  if (!differences(made, store.now).length) return;
+  const key = JSON.stringify(only(store.now, "sample", "placement", "correction"));
+  if (key === askedFor) return;
+  askedFor = key;
+  anew();
 });
 slid(canvas, (part) => {
   void play(false);
@@ -496,8 +542,9 @@ window.addEventListener("keydown", (e) => {
     return;
   void open(null, null, true);
 });
-// A viewer that was started again knows nothing of it; a page that was loaded again asks for what its address
-// names: once the viewer has seen the twin, and this page has its own connection to it.
+// A viewer that was started again knows nothing of it; a page that was loaded again asks for what
+// its address names: once the viewer has seen the twin, and this page has its own connection to
+// it.
 let lost = false,
   first = true,
   seen = false;

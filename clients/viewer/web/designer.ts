@@ -1,5 +1,5 @@
-// The scan designer: bars for voxel and tube; what the wished scan will look like. A change of the
-// wish rewrites the script, unless somebody else's stands there.
+// The scan designer: bars for voxel and tube; what the wished scan will look like. A change of
+// the wish rewrites the script, unless somebody else's stands there.
 import { $input, bars, bytes, cleared, el, fixed, seconds, setText, words } from "./dom.js";
 import { differences, listed, only, sampleOf, type Fingerprint } from "./fingerprint.js";
 import type { ExposurePrediction, TransmissionShares } from "./viewer.js";

@@ -71,8 +71,8 @@ export function pressed(f: () => unknown) {
     },
   };
 }
-// A field for a number (as text: browsers drop what they cannot read from number fields without a word).
-// What is typed is marked until Enter applies it or Escape takes it back.
+// A field for a number (as text: browsers drop what they cannot read from number fields without a
+// word). What is typed is marked until Enter applies it or Escape takes it back.
 export function field(
   attributes: Attributes,
   apply: () => unknown,
@@ -133,7 +133,8 @@ export function base64(buffer: ArrayBuffer): string {
 }
 // A canvas's pixels in two dimensions, and one that was not refused.
 export function context2d(canvas: HTMLCanvasElement): CanvasRenderingContext2D {
-  const context = canvas.getContext("2d", { willReadFrequently: true }); // images are made, and read back, by the processor
+  // Images are made, and read back, by the processor.
+  const context = canvas.getContext("2d", { willReadFrequently: true });
   if (!context) throw new Error("this browser draws nothing");
   return context;
 }
@@ -224,7 +225,8 @@ export function chosen(input: HTMLInputElement, take: (file: File) => unknown): 
     input.value = "";
   });
 }
-// A term that explains itself where it stands: under the pointer, when tapped, and when the keyboard comes to it.
+// A term that explains itself where it stands: under the pointer, when tapped, and when the
+// keyboard comes to it.
 export const term = (words: string, tip: string): HTMLElement =>
   el(
     "button",
@@ -234,7 +236,8 @@ export const term = (words: string, tip: string): HTMLElement =>
 // What went wrong, in words.
 export const words = (error: unknown): string =>
   error instanceof Error ? error.message : String(error);
-// The element of a kind that an event happened within; elements of other frames are of other classes.
+// The element of a kind that an event happened within; elements of other frames are of other
+// classes.
 export const within = (target: EventTarget | null, selector: string): Element | null =>
   (target as Partial<Element> | null)?.closest?.(selector) ?? null;
 // Keeps a choice in this browser, if it has room.

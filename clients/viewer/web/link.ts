@@ -1,5 +1,5 @@
-// The page's connection to its viewer: requests with answers, newest states and images, how old they are,
-// reconnection.
+// The page's connection to its viewer: requests with answers, newest states and images, how old
+// they are, reconnection.
 import { keep, words } from "./dom.js";
 import {
   differences,
@@ -59,7 +59,8 @@ export const store = {
   coneVec: null as number[] | null,
   cameras: null as Record<string, Camera> | null,
 };
-// Older than OLD_S, what is shown is said to be old; after SILENT_S nobody waits for answers any more.
+// Older than OLD_S, what is shown is said to be old; after SILENT_S nobody waits for answers any
+// more.
 export const OLD_S = 1;
 const SILENT_S = Number(new URLSearchParams(location.search).get("patience") ?? 5),
   LOOK_MS = 200,
@@ -133,8 +134,9 @@ export function rename(name: string): void {
   socket?.close();
 }
 export function connect() {
+  const scheme = location.protocol === "https:" ? "wss" : "ws";
   socket = new WebSocket(
-    `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws/${pageId}?person=${encodeURIComponent(person())}`,
+    `${scheme}://${location.host}/ws/${pageId}?person=${encodeURIComponent(person())}`,
   );
   socket.binaryType = "arraybuffer";
   socket.onopen = () => {
@@ -230,9 +232,9 @@ function text(content: string) {
   if (m.type in handlers) handlers[m.type](m as never);
 }
 
-// How old what is shown is: since the last heartbeat of the viewer, what that one took, and how long the twin
-// has told the viewer nothing. Of the two clocks' difference the least one seen stands for no delay; it may
-// grow by the error of clocks.
+// How old what is shown is: since the last heartbeat of the viewer, what that one took, and how
+// long the twin has told the viewer nothing. Of the two clocks' difference the least one seen
+// stands for no delay; it may grow by the error of clocks.
 const DRIFT = 1e-4;
 let heard: { at: number; late: number; silent: number } | null = null,
   least: { lag: number; at: number } | null = null;
@@ -266,8 +268,8 @@ function look() {
     apart && differs !== null ? (now - Math.max(differs, apart.at_ms)) / 1000 : 0;
   emit("age");
 }
-// A page that itself stood still (much to draw, a laptop asleep) first reads what has come meanwhile, before it
-// says that the viewer is silent.
+// A page that itself stood still (much to draw, a laptop asleep) first reads what has come
+// meanwhile, before it says that the viewer is silent.
 let looked = performance.now(),
   woken = -Infinity;
 const rested = () =>

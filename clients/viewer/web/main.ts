@@ -7,6 +7,7 @@ import "./warnings.js";
 import "./axes.js";
 import { picture, shown as film, value } from "./film.js";
 import "./setup.js";
+import "./uploads.js";
 import * as scan from "./scan.js";
 import "./scan_bar.js";
 import "./scan_frames.js";
@@ -32,11 +33,18 @@ $button("#theme").addEventListener("click", () => theme(!dark()));
 $button("#help").addEventListener("click", toggleHelp);
 on("open", () => theme(dark()));
 
-window.addEventListener("popstate", () => { tab(known(asked("tab"))); const view = asked("view"); if (view) layout(view); data.restore(); });
+window.addEventListener("popstate", () => {
+  tab(known(asked("tab")));
+  const view = asked("view");
+  if (view) layout(view);
+  data.restore();
+});
 
 tab(known(asked("tab")));
 listen(window);
 connect();
 // The scenes' frames say which page they belong to, so the page has been registered before.
-on("connection", () => { if (store.cameras?.iso && !$("#views").childElementCount) layout(window.firstView); });
+on("connection", () => {
+  if (store.cameras?.iso && !$("#views").childElementCount) layout(window.firstView);
+});
 window.flexdt = { store, call, scan, data, film, picture, value, volume };

@@ -1,5 +1,5 @@
-// Beads marked by hand in the recorded images of an open data set, to calibrate from: clicked and dragged, or put into
-// the middle by Enter and moved by the arrows.
+// Beads marked by hand in the recorded images of an open data set, to calibrate from: clicked and
+// dragged, or put into the middle by Enter and moved by the arrows.
 import { $input, el, fixed, setText } from "./dom.js";
 import type { Mark, Pair } from "./viewer.js";
 import { emit, on, store } from "./link.js";
@@ -20,7 +20,9 @@ const toggle = el(
     class: "small",
     "aria-pressed": "false",
     title:
-      "Click beads in the images, to calibrate from them; in the radiograph Enter marks its middle, arrows move the last mark by 0.1 px, with Shift by 5",
+      "Click beads in the images, to calibrate from them; " +
+      "in the radiograph Enter marks its middle, " +
+      "arrows move the last mark by 0.1 px, with Shift by 5",
     onclick: () => {
       choose(Boolean(tools.hidden));
     },
@@ -90,11 +92,12 @@ function tell() {
     last && here().includes(last)
       ? ` · ${last.marker} at ${fixed(last.column, 1)}, ${fixed(last.row, 1)}`
       : "";
+  const images = new Set(marks.map((m) => m.frame)).size;
   setText(
     said,
     frame === null
       ? "no projection is shown"
-      : `${several(marks.length, "mark")} in ${several(new Set(marks.map((m) => m.frame)).size, "image")}${at}`,
+      : `${several(marks.length, "mark")} in ${several(images, "image")}${at}`,
   );
 }
 on("recorded", (name) => {
@@ -118,7 +121,8 @@ export function click([column, line]: Pair): void {
   bead.value = String(number + 1);
   again();
 }
-// Whether a press is on a mark, which a drag then moves; a click there is a bead that lies over it.
+// Whether a press is on a mark, which a drag then moves; a click there is a bead that lies over
+// it.
 export function press([column, line]: Pair, reach: number): boolean {
   const near = tools.hidden
     ? undefined

@@ -1,5 +1,5 @@
-// Geometry, beam and nearest parts: of the machine now or, while a data set is open, of the image of
-// it that is shown. Headings say which.
+// Geometry, beam and nearest parts: of the machine now or, while a data set is open, of the image
+// of it that is shown. Headings say which.
 import { $, el, fixed, isNumber, setText, term } from "./dom.js";
 import { about, heading, ofData, type About } from "./fingerprint.js";
 import type { GeometryState, State } from "./viewer.js";

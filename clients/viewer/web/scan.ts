@@ -80,7 +80,8 @@ const said = (line: number) =>
     .filter((p) => p.line === line)
     .map((p) => p.message)
     .join("; ");
-// The lines in sight, under the text itself, which is transparent: component, command, values, comments.
+// The lines in sight, under the text itself, which is transparent: component, command, values,
+// comments.
 function paint() {
   const first = Math.max(0, Math.floor(text.scrollTop / LINE_PX) - 1),
     count = Math.ceil(text.clientHeight / LINE_PX) + 2;
@@ -117,7 +118,8 @@ function tellLine() {
 }
 document.addEventListener("selectionchange", tellLine);
 new ResizeObserver(paint).observe(text);
-// What was found out belongs to the script as it stood: report, marks and timeline go with an edit.
+// What was found out belongs to the script as it stood: report, marks and timeline go with an
+// edit.
 function outdated() {
   problems = [];
   marks();
@@ -184,7 +186,8 @@ async function compose(keep: string[] = []) {
   await check();
   if (text.value === mine) offer(answer.moved, keep);
 }
-// The designer rewrites what was written here; a script of somebody's own stays until Write is pressed.
+// The designer rewrites what was written here; a script of somebody's own stays until Write is
+// pressed.
 let made = "";
 on("design", () => {
   if (!text.value || text.value === made) void compose();
@@ -204,7 +207,8 @@ function offer(moved: Record<string, Pair>, kept: string[]) {
         el(
           "div",
           {},
-          `${axis} stands at ${fixed(now, 2)}${unit(axis)}; the script puts it to ${fixed(then, 2)}`,
+          `${axis} stands at ${fixed(now, 2)}${unit(axis)}; ` +
+            `the script puts it to ${fixed(then, 2)}`,
         ),
       ),
       el(
@@ -327,8 +331,9 @@ export function show(r: Report, made: Fingerprint | null = now()): void {
     box.append(el("div", { class: "steps mono" }, ...r.steps.slice(0, 500).map(stepRow)));
   checked = made;
 }
-// A report holds for what a script begins with. While a scan runs, the machine is on its way: what
-// it then differs in is known when it has ended, and after a run of this script it is checked anew.
+// A report holds for what a script begins with. While a scan runs, the machine is on its way:
+// what it then differs in is known when it has ended, and after a run of this script it is
+// checked anew.
 const BEGUN_WITH = [
   "twin",
   "machine",
@@ -414,7 +419,8 @@ async function showPlan() {
   await makePlan();
   if (plan) $("#timeline-card").scrollIntoView({ block: "nearest" });
 }
-// A plan lives in the viewer: one that was started again makes it anew, once it has seen the twin.
+// A plan lives in the viewer: one that was started again makes it anew, once it has seen the
+// twin.
 on("open", () => {
   lost = plan !== null;
 });

@@ -6,8 +6,8 @@ import type { JobStatus, Shown } from "./viewer.js";
 
 const MAX_THUMBS = 40;
 const WIDTH_PX = 124;
-// The last image may come a little after the scan's end, by our clock, or be of a little after it,
-// by the twin's.
+// The last image may come a little after the scan's end, by our clock, or be of a little after
+// it, by the twin's.
 const LATE_S = 1.5;
 let lastThumb = -1;
 let lastImage = 0;

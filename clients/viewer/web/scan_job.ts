@@ -1,5 +1,5 @@
-// The scan that runs, waits or has ended last: followed by the twin's events, by its states, and by
-// asking where an end was not heard of.
+// The scan that runs, waits or has ended last: followed by the twin's events, by its states, and
+// by asking where an end was not heard of.
 import type { JobStatus } from "./viewer.js";
 import { call, command, emit, Failure, on, store } from "./link.js";
 import { isOver, isUnfinished, problem } from "./job_words.js";
@@ -62,7 +62,8 @@ async function catchUp(): Promise<void> {
   if (status) show(status);
   else forget(); // a twin that knows nothing of it
 }
-// A page that was just opened, or a twin that was started again: the last scan, if it is unfinished.
+// A page that was just opened, or a twin that was started again: the last scan, if it is
+// unfinished.
 on("session", async () => {
   const status = await call("job.status").catch(() => null);
   if (status && !store.job && isUnfinished(status)) show(status);

@@ -1,4 +1,5 @@
-// Bar and notes: whether everything is there, who holds control, stops and resets, what went wrong.
+// Bar and notes: whether everything is there, who holds control, stops and resets, what went
+// wrong.
 import { $, $$, $button, $dialog, $input, el, fixed, setText } from "./dom.js";
 import { listed, sampleOf } from "./fingerprint.js";
 import type { ClockState, State } from "./viewer.js";
@@ -93,7 +94,8 @@ export async function estop(): Promise<void> {
 }
 $button("#estop").addEventListener("click", () => void estop());
 
-// A reset releases the one stop that the page shows, and not before a person has had time to see it.
+// A reset releases the one stop that the page shows, and not before a person has had time to see
+// it.
 const SEEN_MS = 1000;
 let shown: number | null = null;
 function release(s: State) {
@@ -136,7 +138,8 @@ $button("#xrays-off").addEventListener(
 const BUTTON = "the machine's own emergency stop button is the one that counts";
 $button("#stop").addEventListener("click", () => void command("axes.stop", {}, "Stop"));
 
-// What is missing: nothing, the viewer's room for this page, the viewer, the twin, or news of either.
+// What is missing: nothing, the viewer's room for this page, the viewer, the twin, or news of
+// either.
 interface Missing {
   word: string;
   title: string;
@@ -145,7 +148,8 @@ interface Missing {
 const GREETING_S = 3;
 const BACK = "the page comes back by itself";
 const LATE =
-  "viewer or twin do not answer, or the network is slow; what is done here may come late or not at all";
+  "viewer or twin do not answer, or the network is slow; " +
+  "what is done here may come late or not at all";
 function missing(): Missing | null {
   if (store.refused) {
     const title = "The viewer does not serve this page now";
@@ -172,8 +176,8 @@ function missing(): Missing | null {
   }
   return null;
 }
-// A page that was just opened greets with "connecting": what is not there yet is missing only after
-// GREETING_S. A viewer that refuses the page is told at once.
+// A page that was just opened greets with "connecting": what is not there yet is missing only
+// after GREETING_S. A viewer that refuses the page is told at once.
 let greeting = true;
 function greets(found: Missing | null): boolean {
   const arrived = found === null && store.state !== null;

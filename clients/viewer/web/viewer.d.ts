@@ -84,7 +84,7 @@ export interface Answers extends WireAnswers {
 // What the parts of the page tell each other: event -> what comes with it.
 export interface Events {
   note: [level: string, title: string, body?: string];
-  connection: []; open: []; session: []; layers: []; age: []; compare: []; design: [];
+  connection: []; open: []; session: []; layers: []; age: []; compare: []; design: []; samples: [];
   state: [state: State]; job: [job: JobStatus]; scan: [fresh: boolean]; volume: [volume: VolumeMessage]; image: [image?: Shown | null];
   log: [entry: { level: string; message: string }];
   tab: [name: string]; "show-tab": [name: string]; recorded: [name: string | null]; frame: [target: Window];

@@ -113,8 +113,8 @@ export type ImageOrigin = {
 export type ImageValue = { shape: Array<number>; data: string };
 export type JobAbort = { job?: string | null; reason?: string | null };
 export type JobForget = { job?: string | null };
-export type JobForgetResult = Record<string, unknown>;
-export type JobListResult = Record<string, unknown>;
+export type JobForgetResult = { jobs: Array<string> };
+export type JobListResult = { jobs: Array<JobStatus> };
 export type JobRef = { job?: string | null };
 export type JobStatus = {
   job: string; state: "queued" | "running" | "paused" | "done" | "failed" | "aborted" | "incomplete"; name: string;

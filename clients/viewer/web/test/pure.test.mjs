@@ -1,0 +1,267 @@
+// What the page's pure modules compute, as browsers get them; run by tests/viewer/test_page_units.py.
+import assert from "node:assert/strict";
+import { test } from "node:test";
+import * as figures from "../../data/figures.js";
+import * as fp from "../../data/fingerprint.js";
+import * as job from "../../data/job_words.js";
+import * as meshes from "../../data/mesh_extent.js";
+import * as names from "../../data/names.js";
+import { outline } from "../../data/sample_outline.js";
+import * as signals from "../../data/signals.js";
+
+let seed = 20261127;
+const random = () => {
+  seed = (seed * 48271) % 2147483647;
+  return seed / 2147483647;
+};
+const pick = (some) => some[Math.floor(random() * some.length)];
+
+// A state, and what the twin says of an image of it: written down here, not by the page.
+function drawn() {
+  const lit = random() < 0.5;
+  const offset = { x: 1.5, y: 0, z: 0, rx: 0, ry: 0, rz: 0 };
+  const state = {
+    sample: { name: "lego", revision: null, material: "abs", offset },
+    tube: { on: lit, ready: true, kV: 90, power_W: 20 },
+    camera: { mode: "HW2SW1High", roi: [32, 8, 1943, 1527], exposure_ms: 100, averages: 1 },
+    correction: null,
+    geometry: { SOD_mm: 500, SDD_mm: 900 },
+    axes: {
+      rot_obj: { position: 10, virtual: false },
+      mag: { position: 1, virtual: true },
+    },
+  };
+  const origin = {
+    sample: "lego", revision: null, material: "abs", offset: { ...offset }, lit, kV: 90,
+    power_W: 20, mode: "HW2SW1High", exposure_ms: 100, averages: 1, roi: [32, 8, 1943, 1527],
+    correction: null,
+  };
+  return { state, origin, cone: [0, -500, 0, 0, 400, 0, 0.1, 0, 0, 0, 0, 0.1] };
+}
+const HELLO = { instance: "a", machine: "flexray", profile: "cwi" };
+const CHANGES = {
+  sample: (s) => { s.sample.name = "square"; },
+  "sample's content": (s) => { s.sample.revision = "2"; },
+  placement: (s) => { s.sample.offset.rz = 3; },
+  lit: (s) => { s.tube.on = !s.tube.on; },
+  tube: (s) => { s.tube.kV = 91; },
+  camera: (s) => { s.camera.roi = [0, 8, 1943, 1527]; },
+  exposure: (s) => { s.camera.exposure_ms = 100.5; },
+  correction: (s) => { s.correction = { name: "c" }; },
+  pose: (s, cone) => { cone[4] += 0.01; },
+};
+const QUANTITY = { "sample's content": "sample", exposure: "camera" };
+
+test("an image is of now until something that it was made of is another", () => {
+  for (let k = 0; k < 300; k++) {
+    const { state, origin, cone } = drawn();
+    const image = fp.ofImage(origin, [...cone], "a");
+    const changed = Object.keys(CHANGES).filter(() => random() < 0.25);
+    for (const name of changed) CHANGES[name](state, cone);
+    const twin = pick(["a", "b"]);
+    const wanted = new Set(changed.map((name) => QUANTITY[name] ?? name));
+    if (twin === "b") wanted.add("twin");
+    const now = fp.ofNow(state, cone, { ...HELLO, instance: twin });
+    assert.deepEqual(new Set(fp.differences(image, now)), wanted);
+    assert.equal(fp.about(image, now).kind, wanted.size ? "old" : "now");
+  }
+});
+
+test("a thing is compared in what it was made of alone", () => {
+  const { state, cone } = drawn();
+  const now = fp.ofNow(state, cone, HELLO);
+  const report = fp.only(now, "sample", "motors");
+  state.tube.kV = 40;
+  assert.deepEqual(fp.differences(report, fp.ofNow(state, cone, HELLO)), []);
+  state.axes.rot_obj.position = 10.004;
+  assert.deepEqual(fp.differences(report, fp.ofNow(state, cone, HELLO)), []);
+  state.axes.rot_obj.position = 10.02;
+  assert.deepEqual(fp.differences(report, fp.ofNow(state, cone, HELLO)), ["motors"]);
+});
+
+test("what is of a data set is never of now", () => {
+  const { state, cone } = drawn();
+  const now = fp.ofNow(state, cone, HELLO);
+  const about = fp.about(fp.ofData("scan-3", 4), now);
+  assert.equal(fp.heading("Geometry", about), "Geometry of scan-3, image 5");
+  assert.equal(fp.heading("Geometry", fp.about(fp.ofData("scan-3"), now)), "Geometry of scan-3");
+  assert.equal(fp.heading("Geometry", fp.about({}, now)), "Geometry now");
+  assert.deepEqual(fp.differences(fp.ofData("scan-3", 4), now), ["dataset"]);
+});
+
+test("a twin that has not introduced itself is not another one", () => {
+  const { state, origin, cone } = drawn();
+  const image = fp.ofImage(origin, cone, "a");
+  assert.deepEqual(fp.differences(image, fp.ofNow(state, cone, null)), []);
+});
+
+test("quantities are listed in words", () => {
+  assert.equal(fp.listed([]), "");
+  assert.equal(fp.listed(["pose"]), "pose");
+  assert.equal(fp.listed(["sample", "tube", "pose"]), "sample, tube setting and pose");
+});
+
+test("a signal runs what has read it, once a batch, and what has not read it never", () => {
+  const a = signals.signal(1);
+  const b = signals.signal(10);
+  const seen = [];
+  const sum = signals.computed(() => a.get() + b.get());
+  const end = signals.effect(() => seen.push(sum.get()));
+  signals.batch(() => {
+    a.set(2);
+    b.set(20);
+  });
+  a.set(2);
+  assert.deepEqual(seen, [11, 22]);
+  end();
+  a.set(3);
+  assert.deepEqual(seen, [11, 22]);
+  assert.equal(sum.get(), 23);
+  let runs = 0;
+  const chosen = signals.signal(true);
+  signals.effect(() => {
+    runs++;
+    if (chosen.get()) a.get();
+  });
+  chosen.set(false);
+  a.set(4);
+  assert.equal(runs, 2);
+});
+
+// A sample outside, cut or inside, by rays to the corners of its box at many angles.
+function byRays({ size_mm: [sx, sy, sz], offset }, g, c) {
+  const columns = [];
+  const rows = [];
+  for (let k = 0; k < 180; k++) {
+    const turn = (k * Math.PI) / 90;
+    for (const x of [-sx / 2, sx / 2]) for (const y of [-sy / 2, sy / 2]) for (const z of [-sz / 2, sz / 2]) {
+      const [px, py] = [x + offset.x, y + offset.y];
+      const across = px * Math.cos(turn) - py * Math.sin(turn);
+      const depth = g.SOD_mm + px * Math.sin(turn) + py * Math.cos(turn);
+      columns.push(g.axis_column_px + (across * g.SDD_mm) / depth / c.pixel_mm);
+      rows.push(g.piercing_point_px[1] - ((z + offset.z) * g.SDD_mm) / depth / c.pixel_mm);
+    }
+  }
+  const ends = (all) => [Math.min(...all), Math.max(...all)];
+  return { columns: ends(columns), rows: ends(rows) };
+}
+
+test("a sample is inside, cut or outside as the rays to its corners say", () => {
+  const seen = { inside: 0, cut: 0, outside: 0 };
+  for (let k = 0; k < 160; k++) {
+    const side = 5 + 30 * random();
+    const sample = {
+      size_mm: [side, side, 5 + 40 * random()],
+      offset: { x: 4 * random(), y: 4 * random(), z: 20 * (random() - 0.5), rx: 0, ry: 0, rz: 0 },
+    };
+    const c = { shape: [760, 956], pixel_mm: 0.1496 };
+    const g = {
+      SOD_mm: 400, SDD_mm: 800, magnification: 2,
+      axis_column_px: 478 + 2400 * (random() - 0.5) * random(),
+      piercing_point_px: [478, 380 + 900 * (random() - 0.5) * random()],
+    };
+    const said = outline(sample, g, c, 0).join();
+    const { columns, rows } = byRays(sample, g, c);
+    const margin = 12; // the cylinder that holds the box is a little larger
+    const apart = columns[1] < -margin || columns[0] > 956 + margin || rows[1] < -margin || rows[0] > 760 + margin;
+    const inside = columns[0] > margin && columns[1] < 956 - margin && rows[0] > margin && rows[1] < 760 - margin;
+    const crosses = columns[0] < -margin || columns[1] > 956 + margin || rows[0] < -margin || rows[1] > 760 + margin;
+    if (apart) { assert.equal(said, "Sample is outside the image"); seen.outside++; }
+    else if (inside) { assert.equal(said, ""); seen.inside++; }
+    else if (crosses && columns[1] > margin && columns[0] < 956 - margin && rows[1] > margin && rows[0] < 760 - margin) {
+      assert.match(said, /^Sample truncated/); seen.cut++;
+    }
+  }
+  for (const count of Object.values(seen)) assert.ok(count > 4, JSON.stringify(seen));
+});
+
+test("a scan's end names who asked and what stands elsewhere", () => {
+  const axes = {
+    rot_obj: { position: 123.456, moving: false, unit: "deg" },
+    mag_obj: { position: 600, moving: false, unit: "mm" },
+  };
+  const ended = {
+    job: "job-1", state: "aborted", ended_by: "Anna #3", start: { rot_obj: 0, mag_obj: 600 },
+    error: null, frames_done: 4, frames_total: 8, elapsed_s: 61, speed_up: 1, line: null, what: "",
+  };
+  const state = { axes, tube: { on: false }, projector: null };
+  assert.equal(job.stateWords(ended, "Bert #2"), "aborted by Anna #3");
+  assert.equal(job.stateWords(ended, "Anna #3"), "aborted by you");
+  assert.equal(job.whatWords(ended, state), "X-rays are off · rot_obj at 123.46°, began at 0.00°");
+  assert.deepEqual(job.moved(ended, axes), [{ motor: "rot_obj", now: 123.456, start: 0 }]);
+  assert.equal(job.timeLeft(ended), "1 min 01 s");
+  const runs = { ...ended, state: "running", ended_by: null, remaining_s: 30, real_time_factor: 10 };
+  assert.equal(job.timeLeft(runs), "3 s left");
+  assert.equal(job.whatWords(runs, { ...state, projector: "no projector" }), "waits: no projector");
+  assert.equal(job.isUnfinished({ state: "done" }), false);
+  for (const end of ["failed", "aborted", "incomplete"]) assert.ok(job.isUnfinished({ state: end }));
+});
+
+test("names cannot turn the text about them around", () => {
+  for (const mark of ["\u202e", "\u202d", "\u2066", "\u200f", "\u061c"]) {
+    assert.equal(names.plain(`a${mark}b`), "a\ufffdb");
+    assert.equal(names.sampleName(`cube${mark}lts.exe.stl`, []), "cubelts.exe");
+  }
+  assert.equal(names.plain("äöü 試料 שלום"), "äöü 試料 שלום");
+  assert.equal(names.sampleName("a/b.stl", ["a-b"]), "a-b-1");
+});
+
+test("numbers are read as people write them", () => {
+  const said = { "1,5": 1.5, "−2": -2, " 3.25 ": 3.25, "1e3": 1000 };
+  for (const [text, value] of Object.entries(said)) assert.equal(figures.parsed(text), value);
+  for (const text of ["", "abc", "1 2", "0x10", "--1"]) assert.ok(Number.isNaN(figures.parsed(text)));
+  assert.equal(figures.fixed(-0.001), "0.00");
+  assert.equal(figures.seconds(3661), "1 h 01 min");
+  assert.equal(figures.bytes(65_000_000), "65.0 MB");
+});
+
+// A box as a file of a format, written here.
+function boxFile(format, [x, y, z], [ox, oy, oz]) {
+  const corners = [];
+  for (const i of [0, 1]) for (const j of [0, 1]) for (const k of [0, 1]) {
+    corners.push([ox + i * x, oy + j * y, oz + k * z]);
+  }
+  if (format === "obj") return new TextEncoder().encode(corners.map((c) => `v ${c.join(" ")}`).join("\n"));
+  if (format === "off") {
+    const lines = ["OFF", "# a box", "8 0 0", ...corners.map((c) => c.join(" "))];
+    return new TextEncoder().encode(lines.join("\n"));
+  }
+  if (format === "ascii stl") {
+    const vertices = corners.map((c) => `      vertex ${c.map((v) => v.toExponential(6)).join(" ")}`);
+    return new TextEncoder().encode(`solid box\n${vertices.join("\n")}\nendsolid\n`);
+  }
+  const data = new ArrayBuffer(84 + 50 * 8);
+  const view = new DataView(data);
+  view.setUint32(80, 8, true);
+  corners.forEach((c, n) => {
+    for (let corner = 0; corner < 3; corner++) {
+      c.forEach((v, k) => view.setFloat32(84 + 50 * n + 12 + 12 * corner + 4 * k, v, true));
+    }
+  });
+  return new Uint8Array(data);
+}
+
+test("the size of a mesh is read from its file", () => {
+  for (let k = 0; k < 40; k++) {
+    const size = [1, 2, 3].map(() => 0.1 + 50 * random());
+    const place = [1, 2, 3].map(() => 100 * (random() - 0.5));
+    for (const format of ["obj", "off", "ascii stl", "stl"]) {
+      const file = boxFile(format, size, place);
+      const ending = format.split(" ").pop();
+      const buffer = file.buffer.slice(file.byteOffset, file.byteOffset + file.byteLength);
+      const found = meshes.meshExtent(buffer, ending);
+      found.forEach((v, i) => assert.ok(Math.abs(v - size[i]) < 1e-4, `${format} ${found} ${size}`));
+    }
+  }
+  const noise = Uint8Array.from({ length: 500 }, () => 256 * random()).buffer;
+  for (const format of ["stl", "obj", "off", "glb", "ply"]) {
+    assert.equal(meshes.meshExtent(noise, format), null);
+    assert.equal(meshes.meshExtent(new ArrayBuffer(0), format), null);
+  }
+});
+
+test("an absurd size is called that, and a usual one is not", () => {
+  assert.match(meshes.absurd([0.001, 0.001, 0.001], 0.04, 500), /1 µm, 0.025 voxels/);
+  assert.match(meshes.absurd([3000, 2000, 4000], 0.04, 500), /2 m, beyond the source/);
+  for (const mm of [1, 10, 60, 200]) assert.equal(meshes.absurd([mm, mm, mm], 0.04, 500), "");
+});

