@@ -221,3 +221,24 @@ def of_picture(said: dict[str, Any], wire: Wire) -> list[str]:
     if same and not shown["film-old"] and shown["film-beam"] == lit:
         return [f"beam over the radiograph: {said['texts']['film-beam']}, and it is lit: {lit}"]
     return []
+
+
+def pictured_of(state: State) -> tuple[object, object]:
+    """What an image of this state shows: the sample, and everything else that changes it."""
+    motors = {name: round(a.position, 2) for name, a in state.axes.items() if not a.virtual}
+    correction = None if state.correction is None else state.correction.name
+    sample = state.sample
+    return (sample.name, sample.revision), (motors, correction, state.camera.mode)
+
+
+def of_old_picture(page: Any, before: tuple[object, object], state: State) -> list[str]:
+    """Of the radiograph while none can be made: made of `before`, and called old where
+    that is gone."""
+    said, now = page.evaluate(READ), pictured_of(state)
+    picture = said["picture"]
+    if picture is None or picture["recorded"] is not None or before == now:
+        return []
+    tag = said["texts"]["film-old"] if said["shown"]["film-old"] else ""
+    if not tag or (before[0] != now[0]) != ("sample" in tag):
+        return [f"the radiograph is of {before[0]}, now is {now[0]}, and it is called {tag!r}"]
+    return []

@@ -19,12 +19,20 @@ from flexdt.clients.client.client import TwinClient
 from flexdt.protocol import RpcError
 from tests.viewer.conftest import Lab, Process, at_rest
 from tests.viewer.looking import until
-from tests.viewer.page_statements import UNENDED, Checked, asked, begun_with, contradictions
+from tests.viewer.page_statements import (
+    UNENDED,
+    Checked,
+    asked,
+    begun_with,
+    contradictions,
+    of_old_picture,
+    pictured_of,
+)
 
 pytestmark = pytest.mark.browser
 SEEDS = 500
 ACTIONS = 8
-SMALL = {"mode": "HW4SW1High", "roi": (700, 500, 1212, 1012)}
+SMALL: dict[str, Any] = {"mode": "HW4SW1High", "roi": (700, 500, 1212, 1012)}
 """A camera whose images cost little."""
 SAMPLES = ("lego", "square", "empty", "normal")
 
@@ -35,6 +43,8 @@ class History:
     def __init__(self, lab: Lab, page: Any, seed: int) -> None:
         self.lab, self.page, self.rng = lab, page, random.Random(seed)
         self.checked, self.projector = Checked(), True
+        self.pictured: tuple[object, object] | None = None
+        """What the newest image shows, by the wire."""
         self.told: list[str] = []
 
     def call(self, method: str, **params: object) -> Any:
@@ -135,7 +145,7 @@ class History:
         port = self.lab.projector.port
         self.lab.projector.stop(signal.SIGKILL)
         self.projector = False
-        self.agree()
+        self.without_images()
         words = ("--port", str(port), "--threads", "1")
         self.lab.projector = Process("flexdt.server.projector.main", *words, log=self.lab.log)
         self.projector = True
@@ -145,10 +155,17 @@ class History:
         process.send_signal(signal.SIGSTOP)
         self.projector = False
         try:
-            self.agree()
+            self.without_images()
         finally:
             process.send_signal(signal.SIGCONT)
         self.projector = True
+
+    def without_images(self) -> None:
+        """What somebody does while no image can be made."""
+        for act in self.rng.sample([self.change_sample, self.move, self.switch], 2):
+            self.told.append(act.__name__)
+            act()
+            self.agree()
 
     def rest(self, twin: TwinClient) -> None:
         """Until no scan runs and nothing moves; one that is paused stays so."""
@@ -160,11 +177,17 @@ class History:
         with self.other() as bert:
             if self.projector:
                 self.rest(bert)
+            else:
+                until(lambda: at_rest(bert), "the motors rest")
             last: list[str] = []
 
             def agreed() -> bool:
-                before = asked(bert, self.projector)
-                found = contradictions(self.page, before, self.projector, self.checked)
+                now = asked(bert, self.projector)
+                found = contradictions(self.page, now, self.projector, self.checked)
+                if self.projector and now.image is not None:
+                    self.pictured = pictured_of(now.state)
+                elif not self.projector and self.pictured is not None:
+                    found += of_old_picture(self.page, self.pictured, now.state)
                 last[:] = found
                 return not found
 

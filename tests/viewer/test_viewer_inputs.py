@@ -454,3 +454,55 @@ def test_a_page_without_its_viewer_says_so(
     alone.locator("#connection", has_text="connected").wait_for()
     assert alone.is_enabled("#take")
     alone.close()
+
+
+def test_no_quantity_has_two_fields(page: Any) -> None:
+    fields = page.evaluate(
+        "[...document.querySelectorAll(':is(#tab-scan, #tab-setup) :is(input, select, textarea)')]"
+        ".map((e) => [e.id, e.dataset.quantity ?? (e.dataset.layer && `layer.${e.dataset.layer}`)])"
+    )
+    assert [id for id, quantity in fields if not quantity] == []
+    quantities = [quantity for _, quantity in fields]
+    assert sorted({q for q in quantities if quantities.count(q) > 1}) == []
+    assert {"scan.frames", "scan.exposure_ms", "scan.kV", "scan.voxel_um"} <= set(quantities)
+
+
+SENT = """
+window.sent = [];
+const send = WebSocket.prototype.send;
+WebSocket.prototype.send = function (data) {
+  if (typeof data === 'string' && data.includes('"method"')) window.sent.push(JSON.parse(data));
+  return send.call(this, data);
+};
+"""
+
+
+def test_designer_and_script_wish_the_same_scan(page: Any, twin: TwinClient, wait: Wait) -> None:
+    """Whatever the camera is set to: one quantity in two fields was two scans."""
+    page.evaluate(f"(() => {{ {SENT} }})()")
+    page.click("#tabs [data-tab=scan]")
+    page.fill("#script", "")
+    page.evaluate("flexdt.call('sample.set', {name: 'lego'}).then(() => null)")
+    page.click("#designer summary")
+    newest = "name => window.sent.filter((r) => r.method === name).at(-1)?.params"
+    for ms, frames, typed in ((150, 91, None), (400, 45, None), (400, 60, 80)):
+        page.evaluate("ms => flexdt.call('camera.set', {exposure_ms: ms}).then(() => null)", ms)
+        seen(page, twin)
+        if typed is not None:
+            page.fill("#wish-exposure", str(typed))
+        page.fill("#wish-frames", str(frames))
+        page.click("#compose")
+        wanted = {"frames": frames, "exposure_ms": typed or ms}
+        for name in ("viewer.compose", "exposure.predict"):
+            asked = lambda n=name: page.evaluate(newest, n) or {}  # noqa: E731
+            wait(lambda a=asked, w=wanted: a() | w == a(), f"{name} of {wanted}")
+        predicted, composed = (
+            page.evaluate(newest, name) for name in ("exposure.predict", "viewer.compose")
+        )
+        for key in ("kind", "kV", "power_W"):
+            assert predicted[key] == composed[key]
+    page.press("#wish-exposure", "Escape")
+    wait(lambda: page.input_value("#wish-exposure") == "400", "the camera's again")
+    page.click("#designer summary")
+    page.fill("#script", "")
+    page.evaluate("flexdt.call('camera.set', {exposure_ms: 100}).then(() => null)")

@@ -22,7 +22,8 @@ function bar([name, words, unit, digits]) {
     const out = el("output", { id: `design-${name}-is`, class: "mono" });
     const say = () => setText(out, `${fixed(value(name), digits)} ${unit}`);
     const id = `design-${name}`;
-    const steps = { type: "range", min: 0, max: BAR_STEPS, step: "any" };
+    const quantity = { "data-quantity": `scan.${name}` };
+    const steps = { ...quantity, type: "range", min: 0, max: BAR_STEPS, step: "any" };
     inputs[name] = el("input", { ...steps, id, oninput: say, onchange: changed });
     return [
         el("label", { class: "muted", htmlFor: id }, words),
@@ -30,9 +31,10 @@ function bar([name, words, unit, digits]) {
     ];
 }
 function word(id, label, value, title) {
+    const quantity = { "data-quantity": id.replace("design-", "prediction.") };
     return [
         el("label", { class: "muted", htmlFor: id, title }, label),
-        el("input", { type: "text", id, value, title, onchange: changed }),
+        el("input", { ...quantity, type: "text", id, value, title, onchange: changed }),
     ];
 }
 const FILTER = "MATERIAL:MM beside the machine’s own, put there by hand: aluminium:1";

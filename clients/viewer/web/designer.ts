@@ -32,7 +32,8 @@ function bar([name, words, unit, digits]: (typeof BARS)[number]): HTMLElement[] 
   const out = el("output", { id: `design-${name}-is`, class: "mono" });
   const say = () => setText(out, `${fixed(value(name), digits)} ${unit}`);
   const id = `design-${name}`;
-  const steps = { type: "range", min: 0, max: BAR_STEPS, step: "any" };
+  const quantity = { "data-quantity": `scan.${name}` };
+  const steps = { ...quantity, type: "range", min: 0, max: BAR_STEPS, step: "any" };
   inputs[name] = el("input", { ...steps, id, oninput: say, onchange: changed });
   return [
     el("label", { class: "muted", htmlFor: id }, words),
@@ -40,9 +41,10 @@ function bar([name, words, unit, digits]: (typeof BARS)[number]): HTMLElement[] 
   ];
 }
 function word(id: string, label: string, value: string, title: string): HTMLElement[] {
+  const quantity = { "data-quantity": id.replace("design-", "prediction.") };
   return [
     el("label", { class: "muted", htmlFor: id, title }, label),
-    el("input", { type: "text", id, value, title, onchange: changed }),
+    el("input", { ...quantity, type: "text", id, value, title, onchange: changed }),
   ];
 }
 const FILTER = "MATERIAL:MM beside the machine’s own, put there by hand: aluminium:1";
