@@ -49,11 +49,13 @@ from flexdt.runtime import process_threads as _process_threads
 from flexdt.twin import long_work as _long_work
 
 
-def _told(what: str) -> _typing.ContextManager[object]:
+def _told(
+    what: str, progress: _long_work.Progress = None
+) -> _typing.ContextManager[_long_work.Advance]:
     # Here, because logging and threads take a third of the import of flexdt.
     from flexdt.runtime.progress_lines import told
 
-    return told(what)
+    return told(what, progress)
 
 
 _long_work.during = _told

@@ -1,43 +1,242 @@
-"""Progress of work that takes seconds, reported every two of them."""
+"""Show work that takes seconds: a bar on terminals and in notebooks, lines of the log elsewhere.
+
+`told` is what `flexdt.twin.long_work.during` is in a process with a clock. Work that ends within
+`SILENT_S` shows nothing. Work within other work of the same thread lends it its name only: there is
+one bar. Where a program handles the records of the logger `flexdt`, it gets lines, not a bar; a
+level above WARNING of the logger `flexdt.progress` silences both.
+"""
 
 from __future__ import annotations
 
 import logging
+import os
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Final
+
+from flexdt.runtime.progress_bars import Shown, shown_on
+from flexdt.twin.long_work import Advance, Progress, ignore
 
 SILENT_S = 2.0
-"""Interval of progress lines [s]."""
-_last = [0.0, 0.0]
-"""Times of the newest line and of the end of the newest work [s]: kernels compile
-one by one."""
+"""Time for which work goes on unseen, and between two lines of the log [s]."""
+DRAWN_S: Final = 0.5
+"""Time between two drawings of a bar [s]."""
+LOG: Final = logging.getLogger("flexdt.progress")
+"""Logs lines where there is no bar, and at INFO how long each work took."""
+
+
+@dataclass(eq=False)
+class _Work:
+    """Work that goes on.
+
+    Attributes:
+        what: its name.
+        begun: when it began, or the first of the works of its kind that follow each other [s].
+        due: when it is shown next [s].
+        done: fraction; None where nobody says.
+        inner: name of the work within it, "" if there is none.
+        shown: the bar; None before it is drawn.
+        lock: held while it is drawn or ended.
+    """
+
+    what: str
+    begun: float
+    due: float
+    done: float | None = None
+    inner: str = ""
+    shown: Shown | None = None
+    lock: threading.Lock = field(default_factory=threading.Lock)
+    ended: bool = False
+
+    def advance(self, done: float) -> None:
+        """Note the fraction that is done."""
+        self.done = done
+
+    def tell(self) -> None:
+        """Show it as it is now."""
+        with self.lock:
+            if self.ended or not LOG.isEnabledFor(logging.WARNING):
+                return
+            if self.shown is None:
+                self.shown = shown_on(LOG)
+            what = f"{self.what}: {self.inner}" if self.inner else self.what
+            self.shown.show(what, self.done, time.monotonic() - self.begun)
+            self.due = time.monotonic() + (DRAWN_S if self.shown.bar else SILENT_S)
+
+    def end(self) -> None:
+        """Take its bar away."""
+        with self.lock:
+            self.ended = True
+            if self.shown is not None:
+                self.shown.close()
+
+
+class _Teller:
+    """Shows all work of this process from one thread, which starts with the first."""
+
+    def __init__(self) -> None:
+        self._works: list[_Work] = []
+        self._changed = threading.Condition()
+        self._thread: threading.Thread | None = None
+
+    def add(self, work: _Work) -> None:
+        """Show a work from when it is due."""
+        with self._changed:
+            sooner = all(work.due < other.due for other in self._works)
+            self._works.append(work)
+            if self._thread is None:
+                self._thread = threading.Thread(
+                    target=self._run, name="flexdt-long-work", daemon=True
+                )
+                self._thread.start()
+            elif sooner:
+                self._changed.notify()
+
+    def remove(self, work: _Work) -> None:
+        """Show a work no longer."""
+        with self._changed:
+            self._works.remove(work)
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                now = time.monotonic()
+                dues = [work.due for work in self._works]
+                if not dues or min(dues) > now:
+                    self._changed.wait(min(dues) - now if dues else None)
+                    continue
+                due = [work for work in self._works if work.due <= now]
+                for work in due:
+                    work.due = now + SILENT_S
+            for work in due:
+                work.tell()
+
+
+class _Told:
+    """Hand the fraction done on to a caller's function, which hears of the end in any case.
+
+    Args:
+        function: the caller's.
+    """
+
+    def __init__(self, function: Advance) -> None:
+        self._function = function
+        self._last = -1.0
+
+    def advance(self, done: float) -> None:
+        """Hand a fraction on."""
+        self._last = done
+        self._function(done)
+
+    def end(self) -> None:
+        """Say that all is done."""
+        if self._last < 1.0:
+            self._function(1.0)
+
+
+@dataclass(frozen=True)
+class _Entered:
+    """Work that a thread is in.
+
+    Attributes:
+        what: its name.
+        advance: takes the fraction done.
+        work: what is shown; None for work that shows nothing, or that its caller shows.
+    """
+
+    what: str
+    advance: Advance
+    work: _Work | None = None
+
+
+class _Threads(threading.local):
+    """The works that each thread is in, the outermost first."""
+
+    def __init__(self) -> None:
+        self.works: list[_Entered] = []
+
+
+_teller = _Teller()
+_threads = _Threads()
+_last: dict[str, tuple[float, float]] = {}
+"""First word of a work -> when the first of those that follow each other began and the last ended:
+one kernel compiles after another."""
+
+
+def _forget() -> None:
+    """Begin anew in a forked process, where no thread but one lives."""
+    global _teller, _threads
+    _teller, _threads = _Teller(), _Threads()
+
+
+os.register_at_fork(after_in_child=_forget)
 
 
 @contextmanager
-def told(what: str) -> Iterator[None]:
-    """Report work inside that takes long, to the log and so to standard error.
+def told(what: str, progress: Progress = None) -> Iterator[Advance]:
+    """Show the work that goes on inside.
 
     Args:
-        what: the work, for the line.
+        what: its name, such as "calibrating". Work of the same name within it is the same work.
+        progress: the caller's choice.
+
+    Yields:
+        What takes the fraction done.
     """
-    done = threading.Event()
-    begun = time.monotonic()
-    if begun > _last[1] + SILENT_S:
-        _last[0] = begun
+    works = _threads.works
+    if callable(progress):
+        own = _Told(progress)
+        with _entered(works, _Entered(what, own.advance)):
+            yield own.advance
+        own.end()
+    elif works and works[-1].what == what:
+        yield works[-1].advance
+    elif works or progress is False:
+        with _entered(works, _Entered(what, ignore)), _lent(works[0].work, what):
+            yield ignore
+    else:
+        with _shown(what) as work, _entered(works, _Entered(what, work.advance, work)):
+            yield work.advance
 
-    def tell() -> None:
-        """Log a line every `SILENT_S` until the work is done."""
-        while not done.wait(max(0.0, _last[0] + SILENT_S - time.monotonic())):
-            _last[0] = time.monotonic()
-            logging.getLogger("flexdt.kernels").warning(
-                "flexdt: still %s (%.0f s)", what, _last[0] - begun
-            )
 
-    threading.Thread(target=tell, name="flexdt-long-work", daemon=True).start()
+@contextmanager
+def _shown(what: str) -> Iterator[_Work]:
+    """Have a work shown until it ends."""
+    kind, now = what.split(" ", maxsplit=1)[0], time.monotonic()
+    begun, ended = _last.get(kind, (now, now))
+    begun = begun if now <= ended + SILENT_S else now
+    work = _Work(what, begun, max(now, begun + SILENT_S))
+    _teller.add(work)
+    try:
+        yield work
+    finally:
+        _teller.remove(work)
+        work.end()
+        _last[kind] = begun, time.monotonic()
+        LOG.info("flexdt: %s took %.2f s", what, time.monotonic() - now)
+
+
+@contextmanager
+def _entered(works: list[_Entered], one: _Entered) -> Iterator[None]:
+    """Be in a work."""
+    works.append(one)
     try:
         yield
     finally:
-        done.set()
-        _last[1] = time.monotonic()
+        works.remove(one)
+
+
+@contextmanager
+def _lent(outer: _Work | None, what: str) -> Iterator[None]:
+    """Lend a work that is shown the name of one within it."""
+    if outer is None:
+        yield
+        return
+    before, outer.inner = outer.inner, what
+    try:
+        yield
+    finally:
+        outer.inner = before

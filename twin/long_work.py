@@ -1,10 +1,74 @@
-"""Work that takes seconds of its own accord: what it goes in, for whoever has a clock."""
+"""Name work that takes seconds, so that whoever has a clock and a screen can show how far it is."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from typing import Protocol, TypeAlias, TypeVar
 
-during: Callable[[str], AbstractContextManager[object]] = nullcontext
-"""Context manager that reports the work named by its argument; `flexdt.runtime.progress_lines`
-replaces it."""
+Part = TypeVar("Part")
+Advance: TypeAlias = Callable[[float], None]
+"""Takes the fraction of the work that is done, 0 to 1."""
+Progress: TypeAlias = bool | Advance | None
+"""What callers choose: None or True for a bar after two seconds, False for silence, or a function
+that is called with the fraction done and shows it in its own way."""
+
+
+class Announcer(Protocol):
+    """Shows work while it goes on."""
+
+    def __call__(self, what: str, progress: Progress = None) -> AbstractContextManager[Advance]:
+        """Enter with the work's name and the caller's choice; yields what takes the fraction."""
+
+
+@contextmanager
+def unseen(what: str, progress: Progress = None) -> Iterator[Advance]:
+    """Show nothing; a function among the choices is called all the same."""
+    yield progress if callable(progress) else ignore
+
+
+def ignore(done: float) -> None:
+    """Take the fraction that is done, and do nothing."""
+
+
+class Passes:
+    """Tell the fraction done of work that passes over all of its parts an unknown number of times.
+
+    After n passes n / (n + 1) of it is taken as done.
+
+    Args:
+        count: parts in a pass.
+
+    Attributes:
+        advance: takes the fraction done.
+
+    Example:
+        >>> told, passes = [], Passes(2)
+        >>> passes.advance = told.append
+        >>> _ = [passes.step() for _ in range(4)]
+        >>> told[1::2]
+        [0.5, 0.6666666666666667]
+    """
+
+    def __init__(self, count: int) -> None:
+        self._count, self._seen = max(count, 1), 0
+        self.advance: Advance = ignore
+
+    def step(self) -> None:
+        """Note that a part has been seen."""
+        self._seen += 1
+        passes = self._seen / self._count
+        self.advance(1.0 - 1.0 / (1.0 + passes))
+
+    def counting(self, read: Callable[[int], Part]) -> Callable[[int], Part]:
+        """Count the parts that a function reads."""
+
+        def one(index: int) -> Part:
+            self.step()
+            return read(index)
+
+        return one
+
+
+during: Announcer = unseen
+"""Announces the work named by its argument; `flexdt.runtime.progress_lines` replaces it."""

@@ -34,8 +34,8 @@ from flexdt.clients.cli.commands import process_commands as processes
 from flexdt.clients.cli.commands import scanner_commands as scanner
 from flexdt.clients.cli.commands import script_commands as scripts
 from flexdt.clients.cli.completed_commands import completed
-from flexdt.clients.cli.console import hush, note, printable
-from flexdt.clients.cli.options import Json, Server, TokenFile, argument, option
+from flexdt.clients.cli.console import hush, note, printable, speak
+from flexdt.clients.cli.options import Json, Quiet, Server, TokenFile, Verbose, argument, option
 
 COMMANDS: Final[Mapping[str, Callable[..., object]]] = {
     name.strip("_"): getattr(module, name)
@@ -108,8 +108,11 @@ SECTIONS: Final[Mapping[str, tuple[str, ...]]] = {
 
 OWN: Final[Mapping[str, str]] = {
     "--json": "--json", "--server": "--server HOST:PORT", "--token-file": "--token-file FILE",
+    "--quiet": "--quiet", "-q": "-q", "--verbose": "--verbose", "-v": "-v",
 }  # fmt: skip
 """Options of `flexdt` itself that may also follow the command's name, as help pages show them."""
+WITH_VALUE: Final = ("--server", "--token-file")
+"""Those of `OWN` that a value follows."""
 
 
 def own_first(words: Sequence[str], flags: Collection[str]) -> tuple[list[str], list[str]]:
@@ -123,7 +126,7 @@ def own_first(words: Sequence[str], flags: Collection[str]) -> tuple[list[str], 
             rest.append(word)
         else:
             first.append(word)
-            first += islice(more, 1 if word in OWN and word != "--json" else 0)
+            first += islice(more, 1 if word in WITH_VALUE else 0)
     return first, rest
 
 
@@ -138,7 +141,7 @@ class InSections(TyperGroup):
                 command = command.commands.get(word)
         heeds = getattr(getattr(command, "callback", None), "heeds", ())
         first, rest = own_first(args, heeds)
-        if first and first[-1] in OWN and first[-1] != "--json":
+        if first and first[-1] in WITH_VALUE:
             ctx.fail(f"Option '{first[-1]}' requires an argument.")
         if command not in (None, self) and rest[0].partition("=")[0] in OWN:
             ctx.fail(f"{rest[0].partition('=')[0]} is no option of `flexdt {command.name}`")
@@ -183,8 +186,11 @@ def build(words: Sequence[str] | None = None) -> typer.Typer:
         json: Json = False,
         server: Server = None,
         token_file: TokenFile = None,
+        quiet: Quiet = False,
+        verbose: Verbose = False,
     ) -> None:
         """What these options say, `completed` commands take from the context."""
+        speak(quiet, verbose)
 
     for name, command in COMMANDS.items():
         passes = name == "up" or name in ALONE

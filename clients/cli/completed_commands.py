@@ -22,6 +22,10 @@ GIVEN: Final = ("context", "twin", "json")
 """Parameters of commands that are no options of theirs."""
 
 
+TALK: Final = ("--quiet", "-q", "--verbose", "-v")
+"""Options of `flexdt` that all of these commands heed."""
+
+
 def completed(command: Callable[..., Any]) -> tuple[Callable[..., None], tuple[str, ...]]:
     """A command as typer takes it, and the options of `flexdt` that it heeds."""
     own = inspect.signature(command, eval_str=True).parameters
@@ -59,7 +63,8 @@ def completed(command: Callable[..., Any]) -> tuple[Callable[..., None], tuple[s
     offered = (_with_choices(p) for name, p in own.items() if name not in GIVEN)
     has_parameters(complete, [context, *offered])
     heeds = ("--json",) if yields or "json" in own else ()
-    return complete, (*heeds, "--server", "--token-file") if "twin" in own else heeds
+    reaches = ("--server", "--token-file") if "twin" in own else ()
+    return complete, (*heeds, *reaches, *TALK)
 
 
 def _with_choices(parameter: inspect.Parameter) -> inspect.Parameter:

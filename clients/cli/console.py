@@ -14,10 +14,34 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
+
+from flexdt.twin import long_work
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
+
+
+_quiet = False
+"""Whether progress is not shown."""
+
+
+def speak(quiet: bool, verbose: bool) -> None:
+    """Set how much is said on standard error beside warnings and errors.
+
+    Args:
+        quiet: no progress.
+        verbose: what takes time and how long it took, and what libraries log.
+    """
+    global _quiet
+    _quiet = quiet
+    if quiet or verbose:
+        import logging
+
+        logging.getLogger("flexdt.progress").setLevel(logging.ERROR if quiet else logging.INFO)
+        if verbose:
+            logging.basicConfig(level=logging.INFO, format="%(name)s: %(message)s")
 
 
 def printable() -> None:
@@ -129,8 +153,11 @@ class ProgressBar:
         self._task: TaskID | None = None
         self._begun = self._spoken = clock()
         self._last: tuple[float, float] | None = None
+        self._alone = ExitStack()
 
     def __enter__(self) -> ProgressBar:
+        if _quiet:
+            return self
         if self._terminal:
             from rich.console import Console
             from rich.progress import MofNCompleteColumn, Progress, TextColumn
@@ -139,6 +166,8 @@ class ProgressBar:
             counted = MofNCompleteColumn(), TextColumn(self._unit)
             self._bar = Progress(*usual, *counted, console=Console(stderr=True))
             self._bar.start()
+            # Kernels that are compiled meanwhile draw no bar of their own over this one.
+            self._alone.enter_context(long_work.during(self._title, long_work.ignore))
             self._task = self._bar.add_task(self._title, total=None)
         else:
             note(f"{self._title} ...")
@@ -150,6 +179,8 @@ class ProgressBar:
             self._bar.update(
                 self._task, completed=done, total=total, description=text or self._title
             )
+            return
+        if _quiet:
             return
         now = self._clock()
         if now - self._spoken < PLAIN_INTERVAL_S or (done, total or 0.0) == self._last:
@@ -167,5 +198,6 @@ class ProgressBar:
         return line
 
     def __exit__(self, *_: object) -> None:
+        self._alone.close()
         if self._bar is not None:
             self._bar.stop()

@@ -244,6 +244,10 @@ def _require_same(topic: str, asked: Mapping[str, object], known: Mapping[str, o
             )
 
 
+SHOWN: Final = ("Progress", "ScanProgress")
+"""Annotations of `progress` where a method shows a bar of its own accord."""
+
+
 class ClientMethod(Generic[_P, _R]):
     """A method made of a function that makes a flow, with its signature and docstring.
 
@@ -252,17 +256,22 @@ class ClientMethod(Generic[_P, _R]):
     """
 
     def __init__(self, make: Callable[_P, Flow[_R]]) -> None:
+        made = inspect.signature(make)
+        shows = "progress" in made.parameters and made.parameters["progress"].annotation in SHOWN
+
         @functools.wraps(make)
         def blocking(self: TwinClient, /, *args: _P.args, **kwargs: _P.kwargs) -> _R:
             return self.run(make(*args, **kwargs))
 
         @functools.wraps(make)
         async def awaited(self: AsyncTwinClient, /, *args: _P.args, **kwargs: _P.kwargs) -> _R:
+            # Others' work goes on in this thread meanwhile: a bar would stand for all of it.
+            if shows and "progress" not in made.bind_partial(*args, **kwargs).arguments:
+                kwargs["progress"] = False
             return await self.run(make(*args, **kwargs))
 
         self._methods: dict[bool, Any] = {False: blocking, True: awaited}
         # What help() and notebooks show: with self, without Flow.
-        made = inspect.signature(make)
         own = inspect.Parameter("self", inspect.Parameter.POSITIONAL_ONLY)
         returns = str(made.return_annotation).removeprefix("Flow[").removesuffix("]")
         parameters = [own, *made.parameters.values()]

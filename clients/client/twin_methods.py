@@ -28,6 +28,8 @@ from flexdt.protocol.methods import image_messages as images
 from flexdt.protocol.methods import job_messages as scans
 from flexdt.protocol.methods import scanner_messages as scanner
 from flexdt.protocol.methods import session_messages as session
+from flexdt.twin import long_work
+from flexdt.twin.long_work import Progress
 
 if TYPE_CHECKING:
     from flexdt.phantoms import Phantom
@@ -38,6 +40,9 @@ SpeedUp = float | Literal["max"]
 Positions = Mapping[str, float]
 Job = str | scans.SubmitResult | s.JobStatus
 """A job by its name, or what submitted it or told of it."""
+
+ScanProgress = Callable[[s.JobStatus], object] | bool | None
+"""None or True for a bar of frames, False for silence, or what is called with each status."""
 
 CHUNK: Final = 4 * 2**20
 """Bytes in one message of an upload: below a frame, also as base64."""
@@ -97,6 +102,7 @@ def move(
     wait: bool = False,
     plan: bool = False,
     shortest: bool = False,
+    progress: Progress = None,
 ) -> Flow[scanner.MoveResult]:
     """Move axes [mm, deg, script's sign]; they start together.
 
@@ -105,6 +111,7 @@ def move(
         wait: return when the motion has ended.
         plan: go around obstacles.
         shortest: rot_obj by the shortest way instead of to the accumulated angle.
+        progress: where `wait`, show after two seconds that axes move; False for silence.
 
     Raises:
         RpcError: -32001 limit, -32002 collision, -32003 busy or not the controller.
@@ -115,10 +122,12 @@ def move(
         >>> round(twin.state().axes["rot_obj"].position, 6)
         30.0
     """
-    return ask(
-        scanner.AXES_MOVE, None if wait else OWN_PATIENCE, targets=dict(targets),
-        relative=relative, wait=wait, plan=plan, shortest=shortest,
-    )  # fmt: skip
+    with long_work.during("moving", progress if wait else False):
+        moved = yield from ask(
+            scanner.AXES_MOVE, None if wait else OWN_PATIENCE, targets=dict(targets),
+            relative=relative, wait=wait, plan=plan, shortest=shortest,
+        )  # fmt: skip
+        return moved
 
 
 def jog(axis: str, velocity: float, lease_s: float = 0.5) -> Flow[scanner.MoveResult]:
@@ -723,7 +732,7 @@ def forget_job(job: Job | None = None, *, days: float | None = None) -> Flow[sca
 
 def wait_job(
     job: Job | None = None,
-    progress: Callable[[s.JobStatus], object] | None = None,
+    progress: ScanProgress = None,
     *,
     poll_s: float = 0.2,
     timeout_s: float | None = None,
@@ -733,7 +742,8 @@ def wait_job(
     Args:
         job: which one, by name or as `submit_script` and its kin returned it; the current one if
             left out.
-        progress: called with each status.
+        progress: a bar of frames after two seconds; False for none, or what is called with each
+            status.
         poll_s: time between two requests for the status [s].
         timeout_s: give up waiting after this time [s]; the job goes on.
 
@@ -748,16 +758,20 @@ def wait_job(
         'done'
     """
     deadline = None if timeout_s is None else time.monotonic() + timeout_s
-    while True:
-        status = yield from job_status(job)
-        job = status.job
-        if progress is not None:
-            yield Tell(progress, (status,))
-        if status.state in FINAL_STATES:
-            return status
-        if deadline is not None and time.monotonic() > deadline:
-            raise TimeoutError(f"job {status.job} is {status.state} after {timeout_s:g} s")
-        yield Sleep(poll_s)
+    own = progress if callable(progress) else None
+    shown = False if callable(progress) else progress
+    with long_work.during("scanning", shown) as advance:
+        while True:
+            status = yield from job_status(job)
+            job = status.job
+            advance(status.frames_done / max(status.frames_total, 1))
+            if own is not None:
+                yield Tell(own, (status,))
+            if status.state in FINAL_STATES:
+                return status
+            if deadline is not None and time.monotonic() > deadline:
+                raise TimeoutError(f"job {status.job} is {status.state} after {timeout_s:g} s")
+            yield Sleep(poll_s)
 
 
 # -- data sets ---------------------------------------------------------------------------

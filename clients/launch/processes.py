@@ -25,6 +25,8 @@ from flexdt.clients.client.client import TwinClient
 from flexdt.library.failure import CommandError
 from flexdt.runtime.process_settings import Physics, Scatter
 from flexdt.runtime.settings import words
+from flexdt.twin import long_work
+from flexdt.twin.long_work import Progress
 from flexdt.twin.signatures import public
 
 STOP_TIMEOUT_S = 30.0
@@ -152,6 +154,7 @@ class LocalTwin:
         speed_up: the twin's seconds for each of yours, or "max".
         truth: file with a hidden misalignment.
         viewer: whether to start the viewer as well; see `viewer_url`.
+        progress: show that the servers start, after two seconds; False for silence.
 
     Raises:
         ServersError: on entering, they did not start; carries the end of their log.
@@ -173,7 +176,9 @@ class LocalTwin:
         speed_up: float | Literal["max"] = "max",
         truth: str | PathLike[str] | None = None,
         viewer: bool = False,
+        progress: Progress = None,
     ) -> None:
+        self._progress = progress
         options = {
             "sample": sample, "machine": machine, "profile": profile, "physics": physics,
             "scatter": scatter, "speed-up": speed_up, "truth": truth,
@@ -200,7 +205,8 @@ class LocalTwin:
                 data = Path(own) / "data" if self._folder is None else self._folder
                 options = {**self._options, "data": data}
                 log = Path(own) / LOG
-                servers = stack.enter_context(Servers(options, log, viewer=self._viewer))
+                with long_work.during("starting the servers", self._progress):
+                    servers = stack.enter_context(Servers(options, log, viewer=self._viewer))
                 client = stack.enter_context(TwinClient(*servers.address))
                 atexit.register(self.stop)
                 self._running = stack.pop_all(), servers, client, data

@@ -6,7 +6,7 @@ line calls too.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Unpack
@@ -19,10 +19,12 @@ from flexdt.library.datasets.exchange import with_geometry
 from flexdt.library.reading.folders import load_dataset, read_tiffs
 from flexdt.library.reading.listed_images import markers_alone
 from flexdt.phantoms import Phantom
+from flexdt.twin import long_work
 from flexdt.twin.algorithms import DEFAULT, PLAIN
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.long_work import Progress
 from flexdt.twin.physics.tube import Tube
 from flexdt.twin.projection import Volume
 from flexdt.twin.signatures import public, with_options_of
@@ -37,6 +39,7 @@ def calibrate(
     phantom: str | Phantom,
     *,
     geometry: ConeVec | str | PathLike[str] | None = None,
+    progress: Progress = None,
     **options: Unpack[CalibrationOptions],
 ) -> Outcome[DataSet]:
     """Estimate the geometry of scans of a bead phantom, or of markers of unknown positions.
@@ -48,6 +51,7 @@ def calibrate(
             markers of which nobody knows where they are.
         geometry: nominal geometry of all frames, or its file: in place of the data set's, or for a
             folder of anybody's TIFF images (see `read_tiffs`).
+        progress: a bar after two seconds; False for none, or what takes the fraction done.
         options: OPTIONS
 
     Returns:
@@ -64,6 +68,17 @@ def calibrate(
         >>> scan = {"geometry": "scan.json", "scale": "0-3=41.5"}
         >>> found = fx.calibrate("my-tiffs", "unknown", **scan)  # doctest: +SKIP
     """
+    with long_work.during("calibrating", progress):
+        return _calibrated(data, phantom, geometry, options)
+
+
+def _calibrated(
+    data: Data | Sequence[Data] | None,
+    phantom: str | Phantom,
+    geometry: ConeVec | str | PathLike[str] | None,
+    options: CalibrationOptions,
+) -> Outcome[DataSet]:
+    """Open what is named, and calibrate it; arguments as `calibrate` has them."""
     if isinstance(geometry, str | PathLike):
         geometry = ConeVec.load(geometry)
     markers = options.get("markers")
@@ -96,7 +111,7 @@ def reconstruct(
     scatter_correction: str | Sequence[str] | None = None,
     tube: Tube | None = None,
     parameters: Offsets | None = None,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress = None,
     errors: bool = True,
 ) -> Volume:
     """Reconstruct a data set into a volume in memory.
@@ -120,7 +135,7 @@ def reconstruct(
             scatter and subtract it (a circular scan).
         tube: of the scan, for the two corrections; default: what the data set says.
         parameters: correction; default: the one in force during the scan, if any.
-        progress: called with the fraction done.
+        progress: a bar after two seconds; False for none, or what takes the fraction done.
         errors: of FDK, find what may be off, `volume.bias_bound` and `volume.accuracy`, and warn
             of it; and find the noise, `volume.sigma` (of a circle, of five rows or more).
 
@@ -156,12 +171,13 @@ def reconstruct(
 
 
 @public
-def align(data: Data, *, per_frame: bool = False) -> Aligned[DataSet]:
+def align(data: Data, *, per_frame: bool = False, progress: Progress = None) -> Aligned[DataSet]:
     """Find axis and source plane of an ordinary scan without a phantom.
 
     Args:
         data: a data set or its folder.
         per_frame: look for shifts of single frames (jitter) too; `.dataset` then has them.
+        progress: a bar after two seconds; False for none, or what takes the fraction done.
 
     Returns:
         Axis column and, if the object tells them, roll and yaw of the panel and row of the plane in
@@ -178,7 +194,7 @@ def align(data: Data, *, per_frame: bool = False) -> Aligned[DataSet]:
         >>> found = fx.align(data)  # doctest: +SKIP
         >>> volume = data.with_correction(found.correction).reconstruct("fdk")  # doctest: +SKIP
     """
-    return _opened(data).align(per_frame=per_frame)
+    return _opened(data).align(per_frame=per_frame, progress=progress)
 
 
 def _posed(data: Data, geometry: ConeVec) -> DataSet:

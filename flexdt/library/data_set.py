@@ -6,15 +6,17 @@ method is first called: detection, kernels and figures are heavy.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Unpack
 
 from flexdt.library.calibration.calibration_options import CalibrationOptions
 from flexdt.library.datasets.exchange import with_geometry
 from flexdt.library.datasets.image_set import ImageSet
+from flexdt.twin import long_work
 from flexdt.twin.algorithms import DEFAULT, PLAIN
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.long_work import Progress
 from flexdt.twin.signatures import File, public, with_options_of
 
 if TYPE_CHECKING:
@@ -68,6 +70,7 @@ class DataSet(ImageSet):
         phantom: str | Phantom,
         *,
         geometry: ConeVec | File | None = None,
+        progress: Progress = None,
         **options: Unpack[CalibrationOptions],
     ) -> Outcome[DataSet]:
         """Estimate the geometry from the beads of a phantom; see `flexdt.calibrate`.
@@ -77,21 +80,24 @@ class DataSet(ImageSet):
         Args:
             phantom: a phantom, its name, the path of a phantom file, or "unknown".
             geometry: nominal geometry of all frames, or its file, in place of the data set's.
+            progress: a bar after two seconds; False for none, or what takes the fraction done.
             options: OPTIONS
         """
         from flexdt.library.calibration.calibrate import calibrate_with
 
         posed = self if geometry is None else with_geometry(self, geometry)
-        return calibrate_with([posed], phantom, options)
+        with long_work.during("calibrating", progress):
+            return calibrate_with([posed], phantom, options)
 
-    def align(self, *, per_frame: bool = False) -> Aligned[DataSet]:
+    def align(self, *, per_frame: bool = False, progress: Progress = None) -> Aligned[DataSet]:
         """Estimate the geometry without a phantom; see `flexdt.align`.
 
         `data.with_correction(data.align().correction)` is the corrected data set.
         """
         from flexdt.library.calibration.align_dataset import align_dataset
 
-        return align_dataset(self, per_frame)
+        with long_work.during("aligning", progress):
+            return align_dataset(self, per_frame)
 
     def reconstruct(
         self,
@@ -110,7 +116,7 @@ class DataSet(ImageSet):
         scatter_correction: str | Sequence[str] | None = None,
         tube: Tube | None = None,
         parameters: Offsets | None = None,
-        progress: Callable[[float], None] | None = None,
+        progress: Progress = None,
         errors: bool = True,
     ) -> Volume:
         """Reconstruct into a volume in memory; see `flexdt.reconstruct` for the options.
@@ -141,10 +147,14 @@ class DataSet(ImageSet):
             material=_names(material) if not isinstance(material, str) else material,
             scatter_correction=_names(scatter_correction),
         )
-        tell = None if progress is None else lambda done, whole: progress(done / whole)
-        return reconstruct_volume(
-            self, request, parameters=parameters, progress=tell, errors=errors
-        )
+        with long_work.during("reconstructing", progress) as advance:
+            return reconstruct_volume(
+                self,
+                request,
+                parameters=parameters,
+                progress=lambda done, whole: advance(done / whole),
+                errors=errors,
+            )
 
     def save(self, folder: File) -> None:
         """Write a folder that `flexdt.open` reads: di000000.tif, io000000.tif, scan_000000.tif ...

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -29,9 +29,11 @@ from flexdt.phantoms.channels import (
     scatter_object,
 )
 from flexdt.phantoms.samples import as_phantom
+from flexdt.twin import long_work
 from flexdt.twin.errors import GeometryError, LimitError, require_within
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.long_work import Progress
 from flexdt.twin.machine.camera import CameraSettings, PixelGrid, Roi
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.physics.blur import spot_blur_px
@@ -162,6 +164,7 @@ def project(
     shape: tuple[int, int] | None = None,
     material: str | Mapping[int, str] | None = None,
     voxel_mm: float | Vector | None = None,
+    progress: Progress = None,
 ) -> Float32Array:
     """Line integrals of attenuation, without tube, noise and detector; see `flexdt.simulate`.
 
@@ -175,6 +178,7 @@ def project(
         shape: detector (rows, cols), where the geometry does not say.
         material: of a mesh or an array; {1: "pmma", 2: "steel"} for an array of labels.
         voxel_mm: edge of an array's voxels [mm].
+        progress: a bar after two seconds; False for none, or what takes the fraction done.
 
     Returns:
         float32 (n, rows, cols), dimensionless.
@@ -198,7 +202,8 @@ def project(
     body: Any = sample if plain else as_phantom(sample, material=material, voxel_mm=voxel_mm)
     found = examine(Operation.PROJECT, cone, size, volume=_attenuation(body), boxes=body.boxes)
     warn_of(found, GeometryError)
-    return (forward if plain else line_integrals)(body, cone, size)
+    with long_work.during("projecting", progress):
+        return (forward if plain else line_integrals)(body, cone, size)
 
 
 @public
@@ -217,7 +222,7 @@ def simulate(
     voxel_mm: float | Vector | None = None,
     rays: int | None = None,
     spot_points: int = 1,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress = None,
 ) -> DataSet:
     """Simulate a scan: counts, dark and flat images of a sample.
 
@@ -249,7 +254,7 @@ def simulate(
             and each depth of the sample is blurred as it is. With 1 all are blurred as the rotation
             axis is, and the data set warns where that matters. Ghosts of edges stay where the blur
             [pixels] is more than about a quarter of the points.
-        progress: called with the fraction done.
+        progress: a bar after two seconds; False for none, or what takes the fraction done.
 
     Returns:
         The data set in memory; its `truth` is what lies behind it.
@@ -297,47 +302,47 @@ def simulate(
         detector = Detector()
     panel, camera = _panel(detector, scanner, size, *_pitch(cone))
     design = settings.model(None if scanner is None else tube_of(scanner.tube))
-    phantom = as_phantom(sample, material=material, voxel_mm=voxel_mm)
-    found = examine(
-        Operation.SIMULATE, cone, size, volume=_attenuation(phantom), boxes=phantom.boxes
-    )
-    placed = settled(found, GeometryError)
-    parts = channels(phantom)
-    chain = chain_through(parts, panel, design, settings.mono_keV)
-    nothing = np.zeros(size, np.float32)
-    open_paths = np.zeros((len(parts), *size), np.float32)
-    if exposure_ms is not None:
-        require_within("exposure_ms", exposure_ms, *EXPOSURES_MS, "ms")
-        camera = replace(camera, exposure_ms=float(exposure_ms))
-    elif detector is not None and detector.exposure_ms is None:
-        unit = settings.exposure(1.0)
-        brightest = max(_different(cone), key=lambda row: float(flux_of(row, size).max()))
-        beam = expected_signal(chain, open_paths, brightest, unit).mean_e
-        camera = replace(camera, exposure_ms=_chosen_ms(panel, camera, float(beam.max())))
-    exposure = settings.exposure(camera.exposure_ms, camera.averages)
-    scattered = None
-    if scatter != "off":
-        how = scatter
-        if not isinstance(how, ScatterSettings):
-            how = ScatterSettings(seed=noise or 0)
-        grid = scatter_object(parts, phantom.size_mm, how.voxels)
-        scattered = scan_scatter(grid, cone.rows, size, Beam.of(chain, exposure.kV), how)
-    truth = Truth(
-        phantom, cone, chain, exposure, camera, noise, parts, scattered, rays, spot_points
-    )
+    with long_work.during("simulating", progress) as advance:
+        phantom = as_phantom(sample, material=material, voxel_mm=voxel_mm)
+        found = examine(
+            Operation.SIMULATE, cone, size, volume=_attenuation(phantom), boxes=phantom.boxes
+        )
+        placed = settled(found, GeometryError)
+        parts = channels(phantom)
+        chain = chain_through(parts, panel, design, settings.mono_keV)
+        nothing = np.zeros(size, np.float32)
+        open_paths = np.zeros((len(parts), *size), np.float32)
+        if exposure_ms is not None:
+            require_within("exposure_ms", exposure_ms, *EXPOSURES_MS, "ms")
+            camera = replace(camera, exposure_ms=float(exposure_ms))
+        elif detector is not None and detector.exposure_ms is None:
+            unit = settings.exposure(1.0)
+            brightest = max(_different(cone), key=lambda row: float(flux_of(row, size).max()))
+            beam = expected_signal(chain, open_paths, brightest, unit).mean_e
+            camera = replace(camera, exposure_ms=_chosen_ms(panel, camera, float(beam.max())))
+        exposure = settings.exposure(camera.exposure_ms, camera.averages)
+        scattered = None
+        if scatter != "off":
+            how = scatter
+            if not isinstance(how, ScatterSettings):
+                how = ScatterSettings(seed=noise or 0)
+            grid = scatter_object(parts, phantom.size_mm, how.voxels)
+            scattered = scan_scatter(grid, cone.rows, size, Beam.of(chain, exposure.kV), how)
+        truth = Truth(
+            phantom, cone, chain, exposure, camera, noise, parts, scattered, rays, spot_points
+        )
 
-    def read(number: int, expected: Expected, lit: ExposureSettings = exposure) -> Counts:
-        rng = None if noise is None else frame_rng(noise, number)
-        return read_out(panel, expected, camera, lit, rng)
+        def read(number: int, expected: Expected, lit: ExposureSettings = exposure) -> Counts:
+            rng = None if noise is None else frame_rng(noise, number)
+            return read_out(panel, expected, camera, lit, rng)
 
-    dark = read(0, Expected(nothing, nothing), replace(exposure, xrays_on=False))
-    flat = read(1, expected_signal(chain, open_paths, cone.rows[0], exposure))
-    counts = np.empty((len(cone), *size), np.uint16)
-    for i, image in enumerate(truth.radiographs()):
-        assert image.expected is not None
-        counts[i] = read(2 + i, image.expected)
-        if progress is not None:
-            progress((i + 1) / len(cone))
+        dark = read(0, Expected(nothing, nothing), replace(exposure, xrays_on=False))
+        flat = read(1, expected_signal(chain, open_paths, cone.rows[0], exposure))
+        counts = np.empty((len(cone), *size), np.uint16)
+        for i, image in enumerate(truth.radiographs()):
+            assert image.expected is not None
+            counts[i] = read(2 + i, image.expected)
+            advance((i + 1) / len(cone))
     made = DataSet.from_arrays(counts, cone, dark=dark, flat=flat, name=phantom.name, truth=truth)
     made = replace(made, full_scale=panel.full_scale)
     told = *placed, *image_doubts(made), *_flat_doubt(size, cone), *_spot_doubt(truth)

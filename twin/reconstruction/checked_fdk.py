@@ -8,10 +8,12 @@ from collections.abc import Callable, Iterable
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.twin import long_work
 from flexdt.twin.algorithms import PLAIN
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.long_work import Advance, Progress
 from flexdt.twin.plausibility import Operation, PlausibilityWarning, examine, settled
 from flexdt.twin.projection import Grid, Volume, as_volume
 from flexdt.twin.projection.operators import (
@@ -24,7 +26,7 @@ from flexdt.twin.reconstruction.acquisition.coverage import layer_warnings, lost
 from flexdt.twin.reconstruction.acquisition.truncation import truncation_of
 from flexdt.twin.reconstruction.bias import Bias, bias_of
 from flexdt.twin.reconstruction.feldkamp.backprojection import CHUNK, PIXELS
-from flexdt.twin.reconstruction.feldkamp.fdk import Progress, fdk_parts
+from flexdt.twin.reconstruction.feldkamp.fdk import fdk_parts
 from flexdt.twin.reconstruction.volume_errors import with_errors
 from flexdt.twin.signatures import public
 
@@ -36,7 +38,7 @@ def fdk(
     like: Volume | Grid,
     *,
     window: str = PLAIN,
-    progress: Progress | None = None,
+    progress: Progress = None,
     errors: bool = True,
 ) -> Volume:
     """Reconstruct attenuation from line integrals of a circular or helical scan.
@@ -46,7 +48,7 @@ def fdk(
         cone_vec: ConeVec or (n, 12) [mm].
         like: the grid, or a volume on it, whose values are not used.
         window: of the ramp filter: ram-lak, shepp-logan, cosine, hamming, hann.
-        progress: called with the fraction done.
+        progress: a bar after two seconds; False for none, or what takes the fraction done.
         errors: find `sigma`, `bias_bound` and `accuracy` of the volume, and warn.
 
     Returns:
@@ -94,9 +96,10 @@ def fdk(
     box = as_volume(like).boxes[0]
     found = examine(Operation.FDK, geometry, shape, images=values, grid=box)
     sentences = settled(found, GeometryError)
-    volume, doubts = checked_fdk(
-        values.__getitem__, parts, geometry, shape, like, window, progress, errors=errors
-    )
+    with long_work.during("reconstructing by FDK", progress) as advance:
+        volume, doubts = checked_fdk(
+            values.__getitem__, parts, geometry, shape, like, window, advance, errors=errors
+        )
     for sentence in sentences:
         warnings.warn(sentence, PlausibilityWarning, stacklevel=3)
     for doubt in doubts:
@@ -111,7 +114,7 @@ def checked_fdk(
     shape: tuple[int, int],
     like: Volume | Grid,
     window: str = PLAIN,
-    progress: Progress | None = None,
+    progress: Advance | None = None,
     *,
     errors: bool = True,
 ) -> tuple[Volume, list[str]]:

@@ -14,8 +14,10 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.twin import long_work
 from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.long_work import Advance, Progress
 from flexdt.twin.projection import Grid, Volume
 from flexdt.twin.projection.linear_operator import dot
 from flexdt.twin.reconstruction.linear_system import (
@@ -50,6 +52,7 @@ def sirt(
     hardening: Polychromatic | None = None,
     surroundings: Volume | Grid | None = None,
     watch: Watch | None = None,
+    progress: Progress = None,
 ) -> Volume:
     """Simultaneous iterative reconstruction: x += C A' R (b - A x), R and C inverse row and
     column sums. The residual weighted with R never grows.
@@ -80,6 +83,7 @@ def sirt(
             those measured, uncorrected.
         surroundings: grid of the whole object, coarser than `like`, which lies in it.
         watch: called in every iteration.
+        progress: a bar after two seconds; False for none, or what takes the fraction done.
 
     Returns:
         Volume [1/mm] on the grid of `like`.
@@ -102,9 +106,11 @@ def sirt(
     problem = LinearSystem.of(
         projections, cone_vec, like, iterations, variances, hardening, surroundings
     )
-    return solved(
-        problem, lambda p: _subset_steps(p, [ALL], 1.0, iterations, start, nonnegative, watch)
-    )
+    with long_work.during("solving by SIRT", progress) as advance:
+        return solved(
+            problem,
+            lambda p: _subset_steps(p, [ALL], 1.0, iterations, start, nonnegative, watch, advance),
+        )
 
 
 def sart(
@@ -121,12 +127,13 @@ def sart(
     hardening: Polychromatic | None = None,
     surroundings: Volume | Grid | None = None,
     watch: Watch | None = None,
+    progress: Progress = None,
 ) -> Volume:
     """SIRT's step on one subset of views after another: faster at first, noisier in the end.
 
     Args:
-        projections, cone_vec, like, start, nonnegative, variances, hardening, surroundings, watch:
-            as for `sirt`.
+        projections, cone_vec, like, start, nonnegative, variances, hardening, surroundings, watch,
+            progress: as for `sirt`.
         iterations: passes through all views.
         subsets: number of subsets; each takes every k-th view, so it sees all directions.
         relaxation: part of each step that is taken.
@@ -147,10 +154,13 @@ def sart(
         said = f"{subsets} subsets, relaxation {relaxation:g}"
         raise LimitError.instead(said, [subsets, relaxation], "at least 1, and between 0 and 2")
     parts = [np.arange(k, len(problem.geometry), count) for k in far_apart(count)]
-    return solved(
-        problem,
-        lambda p: _subset_steps(p, parts, relaxation, iterations, start, nonnegative, watch),
-    )
+    with long_work.during("solving by SART", progress) as advance:
+        return solved(
+            problem,
+            lambda p: _subset_steps(
+                p, parts, relaxation, iterations, start, nonnegative, watch, advance
+            ),
+        )
 
 
 def _subset_steps(
@@ -161,6 +171,7 @@ def _subset_steps(
     start: Volume | None,
     nonnegative: bool,
     watch: Watch | None,
+    advance: Advance,
 ) -> Volume:
     """SIRT's step on the views of one part after another, for each iteration."""
     sums = [problem.scales(part) for part in parts]
@@ -178,6 +189,7 @@ def _subset_steps(
                 np.maximum(x, 0.0, out=x)
         if watch is not None:
             watch(Step(i + 1, iterations, float(np.sqrt(squares / problem.measured.size))))
+        advance((i + 1) / iterations)
         if weighted and noise <= problem.measured.size:
             break
     return problem.volume(x)
@@ -193,6 +205,7 @@ def cgls(
     start: Volume | None = None,
     surroundings: Volume | Grid | None = None,
     watch: Watch | None = None,
+    progress: Progress = None,
 ) -> Volume:
     """Conjugate gradients for least squares: the residual falls at every iteration.
 
@@ -210,12 +223,18 @@ def cgls(
         True
     """
     problem = LinearSystem.of(projections, cone_vec, like, iterations, surroundings=surroundings)
-    return solved(problem, lambda p: _cgls(p, iterations, start, watch))
+    with long_work.during("solving by CGLS", progress) as advance:
+        return solved(problem, lambda p: _cgls(p, iterations, start, watch, advance))
 
 
 def _cgls(
-    problem: LinearSystem, iterations: int, start: Volume | None, watch: Watch | None
+    problem: LinearSystem,
+    iterations: int,
+    start: Volume | None,
+    watch: Watch | None,
+    advance: Advance,
 ) -> Volume:
+    """Take steps along conjugate directions."""
     x = problem.first(start)
     rest = problem.measured - problem.project(x)
     gradient = problem.spread(rest)
@@ -234,6 +253,7 @@ def _cgls(
         new = dot(gradient, gradient)
         direction = gradient + np.float32(new / norm) * direction
         norm = new
+        advance((i + 1) / iterations)
     return problem.volume(x)
 
 
@@ -245,6 +265,7 @@ def em(
     iterations: int = 30,
     start: Volume | None = None,
     watch: Watch | None = None,
+    progress: Progress = None,
 ) -> Volume:
     """Expectation maximisation: x *= A'(b / A x) / A' 1, positive by construction.
 
@@ -261,12 +282,18 @@ def em(
         True
     """
     problem = LinearSystem.of(projections, cone_vec, like, iterations)
-    return solved(problem, lambda p: _em(p, iterations, start, watch))
+    with long_work.during("solving by EM", progress) as advance:
+        return solved(problem, lambda p: _em(p, iterations, start, watch, advance))
 
 
 def _em(
-    problem: LinearSystem, iterations: int, start: Volume | None, watch: Watch | None
+    problem: LinearSystem,
+    iterations: int,
+    start: Volume | None,
+    watch: Watch | None,
+    advance: Advance,
 ) -> Volume:
+    """Multiply by the ratios of measured and projected line integrals, spread back."""
     measured = np.maximum(problem.measured, np.float32(0))
     whole = problem.spread(ones(measured)).copy(order="K")
     x = problem.first(start)
@@ -277,4 +304,5 @@ def _em(
         image = problem.project(x)
         problem.tell(watch, i, iterations, problem.measured - image)
         x = x * ratio(problem.spread(ratio(measured, image)), whole)
+        advance((i + 1) / iterations)
     return problem.volume(x)

@@ -20,9 +20,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.twin import long_work
 from flexdt.twin.errors import GeometryError, LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.long_work import Advance, Progress
 from flexdt.twin.projection import Grid, Volume, gpu
 from flexdt.twin.projection.device_arrays import DeviceArray
 from flexdt.twin.projection.linear_operator import dot, norm_of
@@ -91,6 +93,7 @@ def minimise_tv(
     nonnegative: bool = True,
     mask: npt.ArrayLike | None = None,
     watch: Watch | None = None,
+    progress: Progress = None,
 ) -> Minimised:
     """The volume of least squared residual plus total variation.
 
@@ -109,6 +112,7 @@ def minimise_tv(
         nonnegative: no value is below zero.
         mask: (nz, ny, nx), where the object may be: all else is zero. Everywhere by default.
         watch: called in every iteration.
+        progress: a bar after two seconds; False for none, or what takes the fraction done.
 
     Returns:
         Volume, costs and whether it converged.
@@ -136,12 +140,16 @@ def minimise_tv(
             raise LimitError.instead(f"{name} {value:g}", value, f"{least:g} or more")
     regular = Regular.of(problem.like, nonnegative, mask)
 
-    def minimised(problem: LinearSystem) -> Minimised:
-        there = isinstance(problem, DeviceProblem)
-        kept = DeviceRegular.of_host(regular, problem.like) if there else regular
-        return _minimised(problem, kept, iterations, weight, tolerance, subsets, start, watch)
+    with long_work.during("minimising total variation", progress) as advance:
 
-    return solved(problem, minimised)
+        def minimised(problem: LinearSystem) -> Minimised:
+            there = isinstance(problem, DeviceProblem)
+            kept = DeviceRegular.of_host(regular, problem.like) if there else regular
+            return _minimised(
+                problem, kept, iterations, weight, tolerance, subsets, start, watch, advance
+            )
+
+        return solved(problem, minimised)
 
 
 @public
@@ -170,7 +178,9 @@ def _minimised(
     subsets: int,
     start: Volume | None,
     watch: Watch | None,
+    advance: Advance,
 ) -> Minimised:
+    """Minimise by passes through subsets, then by accelerated steps."""
     scale = problem.spread(problem.measured)
     strength = weight * max(float(scale.max()), 0.0)
     objective = _Objective(problem, strength, regular)
@@ -187,6 +197,7 @@ def _minimised(
         nonlocal little
         problem.tell(watch, len(costs) - 1, iterations, at.rest)
         costs.append(at.cost)
+        advance((len(costs) - 1) / iterations)
         little = little + 1 if costs[-2] - at.cost <= tolerance * at.cost else 0
         return tolerance > 0 and little >= IN_A_ROW
 

@@ -101,9 +101,10 @@ def align_dataset(data: Images, per_frame: bool = False) -> Aligned[Images]:
     data = replace(data, warnings=tuple(doubts))
     base = NOMINAL if data.correction is None else data.correction.parameters
     frames, poses = _at_rest(data)
-    with long_work.during("aligning"):
+    passes = long_work.Passes(len(data))
+    with long_work.during("aligning") as passes.advance:
         found = align_turn(
-            frames, poses, data.present, data.shape, base,
+            passes.counting(frames), poses, data.present, data.shape, base,
             prior_widths(data.machine, data.profile), np.random.default_rng(0), per_frame,
             data.panel,
         )  # fmt: skip

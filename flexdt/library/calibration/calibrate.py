@@ -182,7 +182,8 @@ def calibrate_datasets(
     want = request or CalibrationRequest(free=("dO_x",) if unknown else SIX)
     if markers is None:
         datasets = [squared(d) for d in datasets]
-    frames = [DatasetFrames(d) for d in datasets]
+    passes = long_work.Passes(sum(map(len, datasets)))
+    frames = [DatasetFrames(d, passes.step) for d in datasets]
     saturated = [found for d in datasets if (found := saturation(d)) is not None]
     low, high = SpotFinder().radius_px
     sought = None
@@ -219,7 +220,7 @@ def calibrate_datasets(
                 Scan(f, d.poses, d.name, prior_widths(d.machine, d.profile))
                 for f, d in zip(frames, datasets, strict=True)
             ]
-            with long_work.during("calibrating"), saturation_named(saturated):
+            with long_work.during("calibrating") as passes.advance, saturation_named(saturated):
                 result = calibrate(scans, target, want, detector=sought)
     result = replace(result, findings=explained_by(saturated, result.findings))
     seconds = time.perf_counter() - start

@@ -27,10 +27,15 @@ _T = TypeVar("_T")
 
 
 class DatasetFrames:
-    """The projections of a data set; see `flexdt.twin.calibration.frame_source.Frames`."""
+    """The projections of a data set; see `flexdt.twin.calibration.frame_source.Frames`.
 
-    def __init__(self, dataset: ImageSet) -> None:
-        self._dataset = dataset
+    Args:
+        dataset: the projections.
+        seen: called for each frame that has been looked at.
+    """
+
+    def __init__(self, dataset: ImageSet, seen: Callable[[], object] = lambda: None) -> None:
+        self._dataset, self._seen = dataset, seen
         rows, cols = dataset.shape
         self._keep = 2 * rows * cols * len(dataset) <= KEEP_BYTES
         self._kept: dict[int, Counts] = {}
@@ -92,5 +97,9 @@ class DatasetFrames:
         return counts
 
     def _each(self, work: Callable[[int], _T]) -> list[_T]:
+        found = []
         with ThreadPoolExecutor(THREADS) as pool:
-            return list(pool.map(work, range(len(self))))
+            for one in pool.map(work, range(len(self))):
+                found.append(one)
+                self._seen()
+        return found

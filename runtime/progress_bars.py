@@ -1,0 +1,147 @@
+"""Draw a bar on a terminal or in a notebook, or write lines of the log."""
+
+from __future__ import annotations
+
+import html
+import logging
+import shutil
+import sys
+from typing import Any, Final, Protocol
+
+WIDTH_CHARS: Final = 24
+"""Characters of a bar on a terminal."""
+LEFT_FROM: Final = 0.02
+"""Fraction done from which the time left is said."""
+NARROWEST_CHARS: Final = 20
+"""Columns of a terminal that is taken for one that does not say its width, if it has fewer."""
+
+
+class Shown(Protocol):
+    """Work on a screen.
+
+    Attributes:
+        bar: whether it is drawn over and over in one place.
+    """
+
+    bar: bool
+
+    def show(self, what: str, done: float | None, seconds: float) -> None:
+        """Draw it as it is now."""
+
+    def close(self) -> None:
+        """Take it away."""
+
+
+def shown_on(log: logging.Logger) -> Shown:
+    """Choose where work is shown: the handlers of a log, a notebook, a terminal, standard error.
+
+    Args:
+        log: whose handlers a program may have set.
+    """
+    if log.hasHandlers():
+        return Lines(log)
+    if _notebook():
+        return NotebookBar()
+    if sys.stderr is not None and sys.stderr.isatty():
+        return TerminalBar()
+    return Lines(log)
+
+
+def _notebook() -> bool:
+    """Whether this process is the kernel of a notebook."""
+    shell: Any = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    return getattr(shell, "kernel", None) is not None
+
+
+def told_time(done: float | None, seconds: float) -> str:
+    """Say how far work is and how long it takes.
+
+    Args:
+        done: fraction; None where nobody knows.
+        seconds: since it began.
+
+    Example:
+        >>> told_time(0.25, 10.0), told_time(None, 3.2)
+        ('25 %, 10 s, about 30 s left', '3 s')
+    """
+    if done is None:
+        return f"{seconds:.0f} s"
+    done = min(max(done, 0.0), 1.0)
+    text = f"{100 * done:.0f} %, {seconds:.0f} s"
+    if LEFT_FROM <= done < 1.0:
+        text += f", about {seconds * (1.0 - done) / done:.0f} s left"
+    return text
+
+
+class Lines:
+    """Write a line of the log each time."""
+
+    bar = False
+
+    def __init__(self, log: logging.Logger) -> None:
+        self._log = log
+
+    def show(self, what: str, done: float | None, seconds: float) -> None:
+        """Write a line."""
+        self._log.warning("flexdt: still %s (%s)", what, told_time(done, seconds))
+
+    def close(self) -> None:
+        """Leave the lines where they are."""
+
+
+class TerminalBar:
+    """Draw a bar in the last line of a terminal, on standard error."""
+
+    bar = True
+
+    def show(self, what: str, done: float | None, seconds: float) -> None:
+        """Draw over what was drawn before."""
+        text = f"{what} {told_time(done, seconds)}"
+        if done is not None:
+            full = round(WIDTH_CHARS * min(max(done, 0.0), 1.0))
+            text = f"{what} [{'#' * full}{'.' * (WIDTH_CHARS - full)}] {told_time(done, seconds)}"
+        columns = shutil.get_terminal_size().columns
+        kept = text[: columns - 1] if columns > NARROWEST_CHARS else text
+        self._write(f"\r\x1b[2K{kept}")
+
+    def close(self) -> None:
+        """Clear the line."""
+        self._write("\r\x1b[2K")
+
+    @staticmethod
+    def _write(text: str) -> None:
+        """Write to standard error, unless it has been closed."""
+        try:
+            sys.stderr.write(text)
+            sys.stderr.flush()
+        except (OSError, ValueError):
+            return
+
+
+class NotebookBar:
+    """Draw a bar below the cell of a notebook, which goes when the work has ended."""
+
+    bar = True
+
+    def __init__(self) -> None:
+        self._handle: Any = None
+
+    def show(self, what: str, done: float | None, seconds: float) -> None:
+        """Draw over what was drawn before."""
+        value = "" if done is None else f' value="{done:.3f}"'
+        text = f"{html.escape(what)} {told_time(done, seconds)}"
+        self._draw(f'<progress max="1"{value} aria-label="{html.escape(what)}"></progress> {text}')
+
+    def close(self) -> None:
+        """Leave an empty place."""
+        if self._handle is not None:
+            self._draw("")
+
+    def _draw(self, markup: str) -> None:
+        """Show HTML in one place."""
+        from IPython.display import HTML, display
+
+        if self._handle is None:
+            self._handle = display(HTML(markup), display_id=True)  # type: ignore[no-untyped-call]
+        else:
+            self._handle.update(HTML(markup))  # type: ignore[no-untyped-call]
