@@ -14,9 +14,7 @@ import time
 from collections.abc import Mapping
 from typing import Any, Final, Literal
 
-import cv2
 import numpy as np
-import numpy.typing as npt
 import viser
 
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
@@ -27,6 +25,7 @@ from flexdt.clients.viewer.scenes.world import world_of
 from flexdt.clients.viewer.scrubbed_plan import Scrubbed, positions_at
 from flexdt.clients.viewer.shown_images import ShownImage, grey, window_of
 from flexdt.clients.viewer.viser_gate import Scenes, look_from
+from flexdt.library.datasets.pictures import png_of
 from flexdt.protocol.state_model import State
 from flexdt.twin.machine.description import Machine, Profile
 
@@ -46,11 +45,7 @@ def picture(client: viser.ClientHandle, width: int, height: int, dark: bool) -> 
     rgba = client.get_render(height, width, transport_format="png", timeout=30.0).astype(np.float32)
     alpha = rgba[:, :, 3:4] / 255.0 if rgba.shape[2] == 4 else np.ones_like(rgba[:, :, :1])
     flat = rgba[:, :, :3] * alpha + np.array(DARK if dark else LIGHT) * (1.0 - alpha)
-    return _png(flat.astype(np.uint8))
-
-
-def _png(pixels: npt.NDArray[np.uint8]) -> bytes:
-    return cv2.imencode(".png", pixels[:, :, ::-1])[1].tobytes()
+    return png_of(flat.astype(np.uint8))
 
 
 def scene_file(
@@ -119,7 +114,7 @@ def beside(state: State | None, image: ShownImage | None) -> str:
         "axes": "x right, y to the detector, z up",
     }  # fmt: skip
     lines = "<br>".join(f"{name}: {html.escape(value)}" for name, value in rows.items())
-    film = "" if image is None else base64.b64encode(_png(grey(image, window_of(image)))).decode()
+    film = "" if image is None else base64.b64encode(png_of(grey(image, window_of(image)))).decode()
     source = f"data:image/png;base64,{film}"
     return (
         '<aside style="position:fixed;left:8px;bottom:8px;width:230px;padding:8px;'

@@ -25,6 +25,7 @@ from flexdt.library.reading.folders import load_dataset
 from flexdt.library.report_page import figure, heading, marked, page, paragraph, table
 from flexdt.phantoms import Phantom
 from flexdt.phantoms.channels import line_integrals
+from flexdt.runtime.files.whole_files import room_named
 from flexdt.twin.calibration.fit.fit import require_identifiable
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
@@ -160,7 +161,9 @@ def write_comparison(comparison: Comparison, out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     for k, frame in enumerate(comparison.frames):
         for name, stack in (("before", comparison.before), ("after", comparison.after)):
-            tifffile.imwrite(out / f"difference_{frame:06d}_{name}.tif", stack[k])
+            file = out / f"difference_{frame:06d}_{name}.tif"
+            with room_named(file):
+                tifffile.imwrite(file, stack[k])
     document = comparison.document
     (out / "compare.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
     rows = [[name, *figures] for name, *figures in rows_of(document)]

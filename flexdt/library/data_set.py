@@ -156,7 +156,7 @@ class DataSet(ImageSet):
                 errors=errors,
             )
 
-    def save(self, folder: File) -> None:
+    def save(self, folder: File, *, resume: bool = False) -> None:
         """Write a folder that `flexdt.open` reads: di000000.tif, io000000.tif, scan_000000.tif ...
         (uint16) and the geometry.
 
@@ -170,9 +170,10 @@ class DataSet(ImageSet):
 
         Args:
             folder: made if it is not there; it must be empty.
+            resume: go on in a folder in which saving this data set was interrupted.
 
         Raises:
-            DatasetExistsError: something is there.
+            DatasetExistsError: something is there; says whether it is half-saved.
             OSError: it cannot be written.
 
         Example:
@@ -188,7 +189,7 @@ class DataSet(ImageSet):
         """
         from flexdt.library.datasets.saving import save_data_set
 
-        save_data_set(self, folder)
+        save_data_set(self, folder, resume)
 
     def to_nxtomo(self, file: File) -> None:
         """Write NeXus's NXtomo (HDF5), which needs h5py (the extra `io`).

@@ -273,6 +273,10 @@ def read_document(folder: Directory) -> DatasetDocument:
     return parse_document(text, str(path))
 
 
+COUNTS: Final = ("u2", "u1", "i2")
+"""Kinds of numbers in TIFFs that are read as counts; none may be below 0."""
+
+
 def read_image(path: Path, shape: tuple[int, int] | None = None) -> npt.NDArray[np.uint16]:
     """Read one TIFF image, uint16 (rows, cols); raises as `read_values`."""
     return np.asarray(read_values(path, shape, "u"), dtype=np.uint16)
@@ -281,7 +285,7 @@ def read_image(path: Path, shape: tuple[int, int] | None = None) -> npt.NDArray[
 def read_values(
     path: Path, shape: tuple[int, int] | None = None, kinds: str = "uf"
 ) -> npt.NDArray[np.uint16 | np.float32]:
-    """Read one TIFF image (rows, cols), uint16 or, where `kinds` has an f, float32.
+    """Read one TIFF image (rows, cols): counts as uint16 or, where `kinds` has an f, float32.
 
     Args:
         path: of the file.
@@ -334,19 +338,13 @@ def _decoded(path: Path, kinds: str) -> npt.NDArray[np.uint16 | np.float32]:
         shape = tuple(series.shape)
         kind = series.dtype
         page = file.pages[0]
-        allowed = [np.dtype(k) for k in ("u2", "f4", "f8") if k[0] in kinds]
-        if len(shape) != 2 or kind.newbyteorder("=") not in allowed:
-            words = " or ".join(map(str, allowed))
-            raise ds.DatasetFormatError(
-                f"{path} is {kind} of shape {shape}; allowed: {words} (rows, columns)",
-                {"path": str(path), "asked": [str(kind), list(shape)]},
-            )
+        _check_kind(path, shape, kind, kinds)
         size = kind.itemsize * math.prod(shape)
         if size > MAX_IMAGE_BYTES:
             message = f"{path} claims {shape[1]} x {shape[0]} pixels"
             most = f"{MAX_IMAGE_BYTES} bytes"
             raise ds.DatasetFormatError.instead(message, size, most, path=str(path))
-        wanted = np.uint16 if kind.kind == "u" else np.float32
+        wanted = np.float32 if kind.kind == "f" else np.uint16
         packing = tifffile.COMPRESSION
         if page.compression in (packing.ADOBE_DEFLATE, packing.DEFLATE):
             _check_inflation(path, raw, page, size)
@@ -358,7 +356,32 @@ def _decoded(path: Path, kinds: str) -> npt.NDArray[np.uint16 | np.float32]:
             if image is None or image.shape != shape or image.dtype != kind.newbyteorder("="):
                 raise ValueError(f"its compression ({page.compression!r}) cannot be undone")
             return np.asarray(image, dtype=wanted)
-        return np.asarray(series.asarray(), dtype=wanted)
+        values = series.asarray()
+        if kind.kind == "i" and values.size and values.min() < 0:
+            said = f"{path} holds counts down to {values.min()}"
+            raise ds.DatasetFormatError.instead(said, int(values.min()), "0 or more")
+        return np.asarray(values, dtype=wanted)
+
+
+def _check_kind(path: Path, shape: tuple[int, ...], kind: np.dtype[Any], kinds: str) -> None:
+    """Refuse what is no image of counts or, where `kinds` has an f, of other values.
+
+    Raises:
+        DatasetFormatError: says what is allowed, and how several images in one file are read.
+    """
+    allowed = [np.dtype(k) for k in (*COUNTS, "f4", "f8") if k[0] in kinds or k in COUNTS]
+    if len(shape) == 2 and kind.newbyteorder("=") in allowed:
+        return
+    words = ", ".join(map(str, allowed))
+    way = ""
+    if len(shape) == 3:
+        way = (
+            "; several images in one file: fx.DataSet.from_arrays(tifffile.imread(FILE), geometry)"
+        )
+    raise ds.DatasetFormatError(
+        f"{path} is {kind} of shape {shape}; allowed: {words} (rows, columns){way}",
+        {"path": str(path), "asked": [str(kind), list(shape)]},
+    )
 
 
 def _check_inflation(path: Path, raw: BinaryIO, page: Any, size: int) -> None:

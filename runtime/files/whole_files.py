@@ -2,20 +2,82 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Final
+
+NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Numbers of the system's errors where a disk or a quota is full."""
+FULL_BYTES: Final = 64 << 10
+"""Free bytes below which a disk is full for a library that gives no number with its error."""
+OF_LIBRARIES: Final = re.compile(r"No space left|errno = (\d+)|requested and \d+ written")
+"""How HDF5 (with the system's number), tifffile and NumPy say that a write was refused."""
+
+
+def require_bytes(path: Path, needed: int) -> None:
+    """Refuse a file that its disk cannot hold, before anything of it is written.
+
+    Args:
+        path: of the file.
+        needed: its size [bytes].
+
+    Raises:
+        OSError: names `path`, and says what it takes and what is free.
+    """
+    free = free_bytes(path)
+    if needed > free:
+        said = f"{os.strerror(errno.ENOSPC)}: it takes {needed} bytes; {free} bytes are free"
+        raise OSError(errno.ENOSPC, said, str(path))
+
+
+@contextmanager
+def room_named(path: Path) -> Iterator[None]:
+    """Have every library say alike that the disk is full, and name the file that was asked for.
+
+    Args:
+        path: what shall be written; the file that is written may be a temporary one beside it.
+
+    Raises:
+        OSError: names `path`, with the system's number and the bytes that are free; of another
+            kind, with the system's own words.
+    """
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        number, file = getattr(error, "errno", None), getattr(error, "filename", None)
+        if file is not None and path.name not in Path(str(file)).name:
+            raise  # another file, such as one that is read meanwhile
+        free = free_bytes(path)
+        words = OF_LIBRARIES.search(str(error))
+        if number is None and words is not None:
+            number = int(words[1] or errno.ENOSPC)
+        if number is None and free < FULL_BYTES:
+            number = errno.ENOSPC
+        if number in NO_ROOM:
+            said = f"{os.strerror(number)}; {free} bytes are free"
+            raise OSError(number, said, str(path)) from None
+        if number is None or not isinstance(error, OSError):
+            raise
+        raise type(error)(number, error.strerror, str(path)) from None
 
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Yield a path to write; the file replaces `path` as a whole, and a
-    failure leaves nothing."""
+    """Yield a path to write; the file replaces `path` as a whole, and a failure leaves nothing.
+
+    Raises:
+        OSError: see `room_named`.
+    """
     part = path.with_name(f".{path.name}.part")
     try:
-        yield part
-        part.replace(path)
+        with room_named(path):
+            yield part
+            part.replace(path)
     finally:
         part.unlink(missing_ok=True)
 

@@ -108,7 +108,7 @@ def test_what_cannot_be_written_or_read_is_said(
     with pytest.raises(fx.TwinError, match=r"one of .*\.mha, \.nii\.gz"):
         VOLUME.save(tmp_path / "v.vtk")
     with pytest.raises(fx.TwinError, match="allowed: cubes"):
-        fx.Volume(DATA, (1, 1, 2)).save(tmp_path / "v.mha")
+        fx.Volume(DATA, (1, 1, 2)).save(tmp_path / "v.tif")
     np.save(tmp_path / "v.npy", DATA)
     for use in (VOLUME.save, fx.Volume.load):
         with pytest.raises(fx.TwinError, match=r"one of \.tif, .*\. NumPy's files have no room"):
@@ -131,3 +131,36 @@ def test_zarr_without_the_extensions_says_how_to_install_them(
         with pytest.raises(fx.TwinError, match=r"in \.zarr needs .*: pip install flexdt"):
             use(tmp_path / "v.zarr")
     assert [path.name for path in tmp_path.iterdir()] == ["v.zarr"]
+
+
+@pytest.mark.parametrize("ending", [".nrrd", ".mha", ".nii.gz"])
+def test_voxels_with_three_edges_come_back(tmp_path: Path, ending: str) -> None:
+    if ending == ".nii.gz":
+        pytest.importorskip("nibabel")
+    values = np.random.default_rng(3).normal(size=(3, 4, 5)).astype(np.float32)
+    volume = fx.Volume(values, (0.5, 0.25, 1.5), (1.0, -2.0, 3.0))
+    volume.save(tmp_path / f"oblong{ending}")
+    back = fx.Volume.load(tmp_path / f"oblong{ending}")
+    np.testing.assert_array_equal(back.data, values)
+    np.testing.assert_allclose(back.voxel_mm, (0.5, 0.25, 1.5), rtol=1e-6)
+    np.testing.assert_allclose(back.center_mm, (1.0, -2.0, 3.0), atol=1e-5)
+    head = (tmp_path / f"oblong{ending}").read_bytes()[:1000]
+    if ending == ".nii.gz":
+        import nibabel
+
+        zooms = nibabel.load(tmp_path / f"oblong{ending}").header.get_zooms()
+        np.testing.assert_allclose(zooms, (0.5, 0.25, 1.5))
+    elif ending == ".mha":
+        assert b"ElementSpacing = 0.5 0.25 1.5\n" in head
+    else:
+        assert b"space directions: (0.5,0,0) (0,0.25,0) (0,0,1.5)\n" in head
+
+
+@pytest.mark.parametrize("ending", [".tif", ".h5"])
+def test_other_formats_say_which_hold_three_edges(tmp_path: Path, ending: str) -> None:
+    volume = fx.Volume(np.zeros((3, 4, 5), np.float32), (0.5, 0.25, 1.5))
+    if ending == ".h5":
+        pytest.importorskip("h5py")
+    with pytest.raises(fx.TwinError, match=r"allowed: cubes, or \.nrrd, \.mha, \.nii\.gz"):
+        volume.save(tmp_path / f"oblong{ending}")
+    assert list(tmp_path.iterdir()) == []

@@ -151,3 +151,37 @@ def test_other_bytes_are_the_files_error(path, junk):
     path.write_bytes(junk)
     with pytest.raises(DatasetError, match=r"scan\.nx"):
         opened(path)
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("m", 1e-3), ("mm", 1.0)])
+def test_angles_pixels_and_distances_make_a_geometry(path, unit, scale):
+    with h5py.File(path, "w") as file:
+        entry(file)
+        for place, length in (("source", -100.0), ("detector", 100.0)):
+            at = file.require_group(f"entry/instrument/{place}")
+            at["distance"] = length * scale
+            at["distance"].attrs["units"] = unit
+    data = fx.open(path)
+    np.testing.assert_allclose(data.geometry.rows, SCAN.rows, atol=1e-9)
+    assert "an upright panel is assumed" in str(data.warnings)
+
+
+def test_angles_and_pixels_need_two_distances(path):
+    with h5py.File(path, "w") as file:
+        entry(file)
+    with pytest.raises(
+        DatasetError, match=r"no source distance, detector distance; give distances="
+    ):
+        fx.open(path)
+    data = fx.open(path, distances=(100.0, 200.0))
+    np.testing.assert_allclose(data.geometry.rows, SCAN.rows, atol=1e-9)
+    folder = fx.open(path.parent, distances=(100.0, 200.0))  # the only scan in its folder
+    np.testing.assert_array_equal(folder.counts(), data.counts())
+
+
+@pytest.mark.parametrize("lacking", ["angles", "pixel"])
+def test_what_else_is_missing_asks_for_a_geometry(path, lacking):
+    with h5py.File(path, "w") as file:
+        entry(file, **{lacking: None})
+    with pytest.raises(DatasetError, match=r"give geometry=fx\.ConeVec\.circular"):
+        fx.open(path, distances=(100.0, 200.0))

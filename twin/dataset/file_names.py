@@ -19,6 +19,8 @@ XRE_SETTINGS: Final = "data settings XRE.txt"
 SCRIPT: Final = "script.txt"
 DOCUMENT: Final = "flexdt.json"
 GEOMETRY: Final = "geometry.json"
+UNFINISHED: Final = "unfinished.json"
+"""In a folder that is being saved, or whose saving was interrupted."""
 _FORBIDDEN: Final = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|\ud800-\udfff]')
 _DEVICE: Final = re.compile(r"(?:con|prn|aux|nul|com[0-9]|lpt[0-9])(?:\..*)?", re.IGNORECASE)
 

@@ -417,4 +417,7 @@ def save(
     else:
         import tifffile
 
-        tifffile.imwrite(file, image)
+        from flexdt.runtime.files.whole_files import room_named
+
+        with room_named(file):
+            tifffile.imwrite(file, image)

@@ -13,7 +13,7 @@ import numpy as np
 
 from flexdt.library.datasets.image_set import ImageSet, references
 from flexdt.library.extras import package
-from flexdt.runtime.files.whole_files import whole_file
+from flexdt.runtime.files.whole_files import require_bytes, whole_file
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.physics.tube import tube_spectrum, voltages
 from flexdt.twin.signatures import File
@@ -26,6 +26,8 @@ HALF_SEEN: Final = 0.5
 field of view is half: the views of a whole turn complete each other."""
 KEYS: Final = {"di": DARK, "io": FLAT}
 """Image keys of what the scanner calls so."""
+BYTES_A_PIXEL: Final = 2
+"""Of counts, uint16."""
 
 
 def save_nxtomo(data: ImageSet, file: File) -> None:
@@ -35,6 +37,8 @@ def save_nxtomo(data: ImageSet, file: File) -> None:
         raise DatasetFormatError(
             f"{data.where}: projections of several shapes; NXtomo has one", {"path": data.where}
         )
+    images = len(references(data)) + len(data)
+    require_bytes(Path(file), images * data.shape[0] * data.shape[1] * BYTES_A_PIXEL)
     with whole_file(Path(file)) as part, h5py.File(part, "w") as out:
         _write(data, out)
 

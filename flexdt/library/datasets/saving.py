@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +13,14 @@ from flexdt.library.datasets.image_set import ImageSet, references
 from flexdt.runtime.files.dataset_folder import tiff_bytes
 from flexdt.runtime.files.directory import Directory
 from flexdt.twin.dataset.dataset_errors import DatasetExistsError
-from flexdt.twin.dataset.file_names import DOCUMENT, GEOMETRY, SCAN_SETTINGS, SCRIPT, XRE_SETTINGS
+from flexdt.twin.dataset.file_names import (
+    DOCUMENT,
+    GEOMETRY,
+    SCAN_SETTINGS,
+    SCRIPT,
+    UNFINISHED,
+    XRE_SETTINGS,
+)
 from flexdt.twin.dataset.flexdt_json import CorrectionEntry
 from flexdt.twin.dataset.rebuild import MATCH_MM
 from flexdt.twin.dataset.scan_settings import ScanSettings
@@ -24,19 +34,20 @@ from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.signatures import File
 
 
-def save_data_set(data: ImageSet, folder: File) -> None:
+def save_data_set(data: ImageSet, folder: File, resume: bool = False) -> None:
     """See `DataSet.save`."""
     path = Path(folder)
     path.mkdir(parents=True, exist_ok=True)
-    if any(path.iterdir()):
-        raise DatasetExistsError(
-            f"{path} is not empty; allowed: a new or an empty folder", {"path": str(path)}
-        )
+    there = {entry.name for entry in path.iterdir()}
+    content = _content_of(data)
+    _require_room_for(path, there, content, resume)
     with Directory(path, sync=False) as out:
+        out.put(UNFINISHED, json.dumps(content, indent=1).encode())
         for name, image in references(data):
             out.put(name, tiff_bytes(image))
         for i in data.present:
-            out.put(data.frames[i].file, tiff_bytes(data.counts(i)))
+            if data.frames[i].file not in there:  # a file appears only when it is whole
+                out.put(data.frames[i].file, tiff_bytes(data.counts(i)))
         for name in (SCAN_SETTINGS, XRE_SETTINGS, SCRIPT):
             if data.folder is not None and (data.folder / name).is_file():
                 out.put(name, (data.folder / name).read_bytes())
@@ -45,6 +56,64 @@ def save_data_set(data: ImageSet, folder: File) -> None:
             out.put(SCAN_SETTINGS, format_scan_settings(stated).encode())
             out.put(XRE_SETTINGS, format_settings(stated).encode())
         out.put(*_geometry(data))
+        out.unlink(UNFINISHED)
+
+
+def _content_of(data: ImageSet) -> dict[str, object]:
+    """Say what a folder will hold: name, number of projections, shape, and a digest of the geometry
+    and of the first projection, by which the same data set is known again.
+    """
+    digest = hashlib.sha256(np.ascontiguousarray(data.geometry.rows).tobytes())
+    if data.present:
+        digest.update(np.ascontiguousarray(data.counts(data.present[0])).tobytes())
+    return {
+        "name": data.name,
+        "projections": len(data.present),
+        "shape": list(data.shape),
+        "digest": digest.hexdigest(),
+    }
+
+
+def _require_room_for(
+    path: Path, there: Collection[str], content: Mapping[str, object], resume: bool
+) -> None:
+    """Check that a folder is empty, or that the same data set was interrupted in it.
+
+    Raises:
+        DatasetExistsError: says what the folder holds, and what is allowed.
+    """
+    if not there:
+        return
+    if UNFINISHED not in there:
+        said = f"{path} is not empty; allowed: a new or an empty folder"
+        raise DatasetExistsError(said, {"path": str(path)})
+    if not resume:
+        said = f"{unfinished(path)}; allowed: resume=True, or an empty folder"
+        raise DatasetExistsError(said, {"path": str(path)})
+    if _noted(path) != content:
+        said = f"{unfinished(path)}, which is another data set than {content['name']!r}"
+        raise DatasetExistsError(f"{said}; allowed: an empty folder", {"path": str(path)})
+
+
+def unfinished(path: Path) -> str:
+    """Say what a folder holds whose saving was interrupted.
+
+    Args:
+        path: of a folder with the file `UNFINISHED`.
+    """
+    noted = _noted(path)
+    images = sum(1 for entry in path.iterdir() if entry.name.startswith("scan"))
+    whole = noted.get("projections", "?")
+    return f"{path} is half-saved: {images} of {whole} projections of {noted.get('name', '?')!r}"
+
+
+def _noted(path: Path) -> Mapping[str, object]:
+    """Read what the folder was to hold; nothing where the file is damaged."""
+    try:
+        noted = json.loads((path / UNFINISHED).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return noted if isinstance(noted, dict) else {}
 
 
 def stated_settings(data: ImageSet) -> ScanSettings | None:

@@ -19,7 +19,8 @@ import numpy.typing as npt
 
 from flexdt.library.data_set import DataSet
 from flexdt.library.datasets.image_doubts import SATURATED
-from flexdt.library.reading.foreign_files import open_file
+from flexdt.library.datasets.saving import unfinished
+from flexdt.library.reading.foreign_files import SCAN_FORMATS, open_file
 from flexdt.library.reading.listed_images import NO_DARK, in_order, listed
 from flexdt.runtime.files.dataset_folder import (
     Folder,
@@ -29,7 +30,13 @@ from flexdt.runtime.files.dataset_folder import (
     read_values,
 )
 from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetFormatError, DatasetMissingError
-from flexdt.twin.dataset.file_names import DOCUMENT, GEOMETRY, SCAN_SETTINGS, XRE_SETTINGS
+from flexdt.twin.dataset.file_names import (
+    DOCUMENT,
+    GEOMETRY,
+    SCAN_SETTINGS,
+    UNFINISHED,
+    XRE_SETTINGS,
+)
 from flexdt.twin.dataset.flexdt_json import DatasetDocument, parse_document
 from flexdt.twin.dataset.normalise import of_intensities
 from flexdt.twin.dataset.rebuild import rebuild
@@ -65,18 +72,22 @@ def load_dataset(
     profile: Profile | None = None,
     ignore_document: bool = False,
     geometry: ConeVec | None = None,
+    distances: tuple[float, float] | None = None,
 ) -> DataSet:
     """Open a data set.
 
     Args:
         folder: a folder of TIFFs with flexdt.json, or with a scanner's settings texts; Nikon's
-            .xtekct file beside its TIFFs; Zeiss's .txrm; or an NXtomo file.
+            .xtekct file beside its TIFFs; Zeiss's .txrm; an NXtomo file; or a folder with one of
+            these.
         machine: the scanner, for texts that do not say one that ships with the package.
         profile: zero offsets to use; default: those of the file, or the profile that reproduces
             the printed figures.
         ignore_document: use the texts alone even if flexdt.json is there.
         geometry: one view for each projection, in place of a file's, or where an NXtomo or .txrm
             file does not say it.
+        distances: source to axis and source to panel [mm], of an NXtomo file that says angles and
+            pixels alone.
 
     Raises:
         DatasetError: what is wrong, with its path.
@@ -86,8 +97,16 @@ def load_dataset(
         >>> len(data), data.shape  # doctest: +SKIP
     """
     if Path(folder).is_file():
-        return open_file(Path(folder), geometry)
+        return open_file(Path(folder), geometry, distances)
     content = list_folder(Path(folder))
+    if UNFINISHED in content.names:
+        raise DatasetMissingError(
+            f"{unfinished(content.path)}; save it once more with resume=True, or remove the folder",
+            {"path": str(content.path)},
+        )
+    foreign = _foreign_file(content)
+    if foreign is not None:
+        return open_file(foreign, geometry, distances)
     if content.document is not None and not ignore_document:
         return _from_document(content, machine, profile)
     if content.geometry is not None and not ignore_document:
@@ -131,6 +150,12 @@ def read_tiffs(
         >>> data.geometry.shape, round(float(data[0][0, 0]), 4)
         ((3, 4, 5), 0.6931)
     """
+    if Path(folder).is_file():
+        raise DatasetFormatError(
+            f"{folder} is a file; allowed: a folder of images. Several images in one file: "
+            "fx.DataSet.from_arrays(tifffile.imread(FILE), geometry)",
+            {"path": str(folder)},
+        )
     content = list_folder(Path(folder))
     names = sorted(content.names)
     darks, flats = (fnmatch.filter(names, pattern) for pattern in (dark, flat))
@@ -219,6 +244,31 @@ def _from_document(content: Folder, machine: Machine | None, profile: Profile | 
     return replace(made, warnings=(*made.warnings, *_predicted_doubts(doc, made.warnings)))
 
 
+def _foreign_file(content: Folder) -> Path | None:
+    """The file that says a whole scan of another program, in a folder without one of ours.
+
+    Returns:
+        None where the folder has images of ours, or no such file, or several.
+    """
+    if content.projections or content.document is not None or content.geometry is not None:
+        return None
+    known = tuple(ending for form in SCAN_FORMATS for ending in form.endings)
+    named = [name for name in content.names if name.lower().endswith(known)]
+    return content.path / named[0] if len(named) == 1 else None
+
+
+def _other_scan(content: Folder) -> str:
+    """Say how a folder of another program's, or of anybody's images, is opened."""
+    for form in SCAN_FORMATS:
+        named = sorted(n for n in content.names if n.lower().endswith(form.endings))
+        if named:
+            return f"; it holds a scan of {form.name}: fx.open({str(content.path / named[0])!r})"
+    images = sorted(n for n in content.names if n.lower().endswith((".tif", ".tiff")))
+    if images:
+        return f"; of {len(images)} other TIFFs: fx.read_tiffs(FOLDER, geometry)"
+    return ""
+
+
 def _predicted_doubts(doc: DatasetDocument, seen: Sequence[str]) -> list[str]:
     """Say what was predicted against a scan's exposure, where its images have not said it."""
     saturated = any(SATURATED in one for one in seen)
@@ -245,7 +295,7 @@ def _from_geometry(content: Folder) -> DataSet:
 def _from_texts(content: Folder, machine: Machine | None, profile: Profile | None) -> DataSet:
     if not content.projections:
         raise DatasetMissingError(
-            f"{content.path}: no projections (scan_000000.tif ...)",
+            f"{content.path}: no projections (scan_000000.tif ...){_other_scan(content)}",
             {"path": str(content.path), "missing": ["scan_000000.tif"]},
         )
     _require_one_each(content)

@@ -28,23 +28,32 @@ class ScanFormat:
         name: of the format or its maker.
         endings: of its files, in lower case.
         read: from a path and a geometry in place of the file's, or None, to the data set.
+        distant: whether `read` takes distances too, where the file has angles and pixels alone.
     """
 
     name: str
     endings: tuple[str, ...]
-    read: Callable[[Path, ConeVec | None], DataSet]
+    read: Callable[..., DataSet]
+    distant: bool = False
 
 
 SCAN_FORMATS: Final = (
     ScanFormat("Nikon", (".xtekct",), read_nikon),
     ScanFormat("Zeiss", (".txrm",), read_zeiss),
-    ScanFormat("NXtomo", FORMATS["nxtomo"].endings, read_nxtomo),
+    ScanFormat("NXtomo", FORMATS["nxtomo"].endings, read_nxtomo, distant=True),
 )
 """In the order in which they are listed."""
 
 
-def open_file(path: Path, geometry: ConeVec | None) -> DataSet:
-    """The data set in a file; a geometry that is given replaces the file's.
+def open_file(
+    path: Path, geometry: ConeVec | None, distances: tuple[float, float] | None = None
+) -> DataSet:
+    """Open the data set in a file; a geometry that is given replaces the file's.
+
+    Args:
+        path: of the file.
+        geometry: one view for each projection.
+        distances: source to axis and to panel [mm].
 
     Raises:
         DatasetError: another kind of file, or one that lacks what is needed; says what.
@@ -52,8 +61,13 @@ def open_file(path: Path, geometry: ConeVec | None) -> DataSet:
     ending = path.suffix.lower()
     for form in SCAN_FORMATS:
         if ending in form.endings:
+            if distances is not None and not form.distant:
+                named = ", ".join(one.name for one in SCAN_FORMATS if one.distant)
+                said = f"{path}: distances with a scan of {form.name}"
+                raise DatasetFormatError.instead(said, list(distances), f"with {named}")
+            more = () if distances is None else (distances,)
             with parsing(path, form.name):
-                return form.read(path, geometry)
+                return form.read(path, geometry, *more)
     listed = ", ".join(f"{form.name} ({', '.join(form.endings)})" for form in SCAN_FORMATS)
     raise DatasetFormatError(
         f"{path} is a file; allowed: a folder, {listed}; else TIFFs with a geometry, "

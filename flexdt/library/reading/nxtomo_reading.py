@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -28,12 +28,16 @@ SMALL_BYTES: Final = 1 << 30
 """Images of which it does not matter how far they were deflated."""
 
 
-def read_nxtomo(path: Path, geometry: ConeVec | None) -> DataSet:
+def read_nxtomo(
+    path: Path, geometry: ConeVec | None, distances: tuple[float, float] | None = None
+) -> DataSet:
     """Read an NXtomo file into memory.
 
     Args:
         path: the file.
-        geometry: one view for each projection; None: the rows of cone_vec in the file.
+        geometry: one view for each projection; None: the rows of cone_vec in the file, or
+            what it says of angles, pixels and distances.
+        distances: source to axis and to panel [mm], in place of the file's.
 
     Raises:
         DatasetFormatError: no HDF5, no NXtomo, images that are not there, or no geometry.
@@ -41,12 +45,15 @@ def read_nxtomo(path: Path, geometry: ConeVec | None) -> DataSet:
     h5py = package("h5py", "NXtomo")
     try:
         with h5py.File(path) as file:
-            return _read(file, path, geometry)
+            return _read(file, path, geometry, distances)
     except OSError as error:
         raise DatasetFormatError(f"{path} is no HDF5 file: {error}", {"path": str(path)}) from None
 
 
-def _read(file: Any, path: Path, geometry: ConeVec | None) -> DataSet:
+def _read(
+    file: Any, path: Path, geometry: ConeVec | None, distances: tuple[float, float] | None
+) -> DataSet:
+    """Read the images of an open file, and their geometry."""
     name, doubts = _entry(file, path)
     group = file[name]
     data, keys = _images_of(group, path)
@@ -63,7 +70,10 @@ def _read(file: Any, path: Path, geometry: ConeVec | None) -> DataSet:
     if not projections.any():
         raise DatasetFormatError(f"{path}: no image has the key of a projection, {PROJECTION}",
                                  {"path": str(path)})  # fmt: skip
-    given = _geometry(file, name, path) if geometry is None else geometry
+    given = geometry
+    if given is None:
+        given, told = _geometry(file, name, path, projections, data.shape[1:], distances)
+        doubts += told
     made = DataSet.from_arrays(
         images[projections], given, dark=several[0], flat=several[1], name=path.stem
     )
@@ -139,21 +149,107 @@ def _sources(data: Any) -> Iterator[str]:
         yield from dict.fromkeys(str(name) for name, *_ in data.external)
 
 
-def _geometry(file: Any, name: str, path: Path) -> ConeVec:
-    """The rows of cone_vec in the file.
+def _geometry(
+    file: Any,
+    name: str,
+    path: Path,
+    projections: npt.NDArray[np.bool_],
+    shape: tuple[int, int],
+    distances: tuple[float, float] | None,
+) -> tuple[ConeVec, list[str]]:
+    """Take the rows of cone_vec in the file, or what its angles, pixel and distances say.
+
+    Args:
+        file: with the entry.
+        name: of the group that holds the images.
+        path: for messages.
+        projections: which images are projections.
+        shape: of an image (rows, cols).
+        distances: source to axis and to panel [mm], in place of the file's.
+
+    Returns:
+        The geometry, and what is assumed of it.
 
     Raises:
-        DatasetFormatError: there are none.
+        DatasetFormatError: the file says too little; lists what is missing.
     """
     entry = file[name.split("/")[0]]
     rows = next((g for g in (_member(file, "cone_vec"), _member(entry, "flexdt/cone_vec"))
                  if g is not None), None)  # fmt: skip
-    if rows is None:
+    if rows is not None:
+        return ConeVec(rows[:]), []
+    angles = _angles(file, name, projections)
+    lengths = {what: _length(file, name, *places) for what, places in LENGTHS.items()}
+    if distances is not None:
+        sod, sdd = distances
+        lengths |= {"source distance": sod, "detector distance": sdd - sod}
+    pixel = lengths["x_pixel_size"]
+    missing = [what for what, length in lengths.items() if not length and what in NEEDED]
+    if angles is None:
+        missing.insert(0, "rotation_angle")
+    if missing or angles is None or pixel is None:
+        way = "geometry=fx.ConeVec.circular(sod=..., sdd=..., angles=..., pixel=...)"
+        if {*missing} <= {"source distance", "detector distance"}:
+            way = "distances=(SOD_MM, SDD_MM), from the source to the axis and to the panel"
         raise DatasetFormatError(
-            f"{path}: NXtomo says no geometry of a cone beam; give it: geometry=ConeVec",
-            {"missing": "geometry"},
+            f"{path}: the file has no cone_vec and no {', '.join(missing)}; give {way}",
+            {"missing": missing},
         )
-    return ConeVec(rows[:])
+    sod, beyond = (abs(lengths[what] or 0.0) for what in ("source distance", "detector distance"))
+    cone = ConeVec.circular(
+        sod=sod,
+        sdd=sod + beyond,
+        angles=np.degrees(angles),
+        shape=shape,
+        pixel=(pixel, lengths["y_pixel_size"] or pixel),
+    )
+    return cone, [
+        f"{path.name} says angles, pixels and distances (source to axis {sod:g} mm, axis to panel "
+        f"{beyond:g} mm): an upright panel is assumed, and the axis in its middle column; `align` "
+        "or `calibrate` finds them"
+    ]
+
+
+LENGTHS: Final[Mapping[str, tuple[str, ...]]] = {
+    "x_pixel_size": ("instrument/detector/x_pixel_size", "x_pixel_size"),
+    "y_pixel_size": ("instrument/detector/y_pixel_size", "y_pixel_size"),
+    "source distance": ("instrument/source/distance", "source/distance"),
+    "detector distance": ("instrument/detector/distance", "distance"),
+}
+"""Lengths of NXtomo, distances from the sample, and where a file may have them, from its entry or
+group."""
+
+NEEDED: Final = ("x_pixel_size", "source distance", "detector distance")
+"""Lengths without which there is no geometry."""
+
+
+def _angles(
+    file: Any, name: str, projections: npt.NDArray[np.bool_]
+) -> npt.NDArray[np.float64] | None:
+    """Angles of the projections [rad]; None where the file has not one for each image."""
+    entry, near = file[name.split("/")[0]], file[name]
+    places = (near, entry, *(one for one in entry.values() if hasattr(one, "get")))
+    for place in places:
+        for at in ("rotation_angle", "sample/rotation_angle"):
+            angles = _member(place, at)
+            if angles is not None and angles.shape == projections.shape:
+                values = np.asarray(angles, dtype=np.float64)[projections]
+                radians = _unit(angles, "deg").startswith("rad")
+                return values if radians else values * (math.pi / 180)
+    return None
+
+
+def _length(file: Any, name: str, *members: str) -> float | None:
+    """A length [mm] that the file states in one of some places; None where it has none."""
+    entry, near = file[name.split("/")[0]], file[name]
+    for place in (entry, near):
+        for member in members:
+            found = _member(place, member)
+            if getattr(found, "size", 0) == 1:
+                scale = UNITS_MM.get(_unit(found, "m"))
+                if scale is not None:
+                    return float(np.ravel(found)[0]) * scale
+    return None
 
 
 def _member(group: Any, name: str) -> Any:
@@ -165,20 +261,11 @@ def _stated(
     file: Any, name: str, geometry: ConeVec, projections: npt.NDArray[np.bool_]
 ) -> Iterator[Finding]:
     """Compare the angles and the pixel that the file states with the geometry."""
+    turn = _angles(file, name, projections)
+    if turn is not None:
+        yield from angle_findings(geometry, turn)
     entry, near = file[name.split("/")[0]], file[name]
     places = (near, entry, *(one for one in entry.values() if hasattr(one, "get")))
-    for place in places:
-        for at in ("rotation_angle", "sample/rotation_angle"):
-            angles = _member(place, at)
-            if angles is not None and angles.shape == projections.shape:
-                unit = _unit(angles, "deg")
-                values = np.asarray(angles, dtype=np.float64)[projections]
-                turn = values if unit.startswith("rad") else values * (math.pi / 180)
-                yield from angle_findings(geometry, turn)
-                break
-        else:
-            continue
-        break
     for place in (near, *(_member(p, "instrument/detector") for p in places)):
         size = None if place is None else _member(place, "x_pixel_size")
         if size is not None and size.size == 1:

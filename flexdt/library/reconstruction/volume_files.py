@@ -6,6 +6,7 @@ voxel size and position go into the file where its format has a place for them.
 
 from __future__ import annotations
 
+import math
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,7 +17,13 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.library.datasets.pictures import png
-from flexdt.library.reconstruction.volume_formats import VOLUME_FORMATS, Sink, VolumeFormat
+from flexdt.library.reconstruction.volume_formats import (
+    VOLUME_FORMATS,
+    Sink,
+    VolumeFormat,
+    VoxelPlaces,
+)
+from flexdt.runtime.files.whole_files import require_bytes, room_named
 from flexdt.twin.errors import LimitError
 from flexdt.twin.projection import Grid, Volume
 from flexdt.twin.signatures import File
@@ -28,18 +35,26 @@ NO_PLACE: Final = (
 
 
 @contextmanager
-def volume_writer(path: Path, grid: Grid) -> Iterator[Sink]:
+def volume_writer(path: Path, grid: Grid | VoxelPlaces) -> Iterator[Sink]:
     """Open `path` for a volume on `grid`; the ending chooses the format.
 
     Raises:
-        LimitError: another ending, or a folder that is not there.
+        LimitError: another ending, a folder that is not there, or voxels that the format has not.
         TwinError: the package that writes the format is not installed.
         OSError: the file cannot be written.
     """
     form = check_name(path)
+    places = VoxelPlaces.of(grid) if isinstance(grid, Grid) else grid
+    if not (form.oblong or places.cubes):
+        allowed = [ending for one in VOLUME_FORMATS if one.oblong for ending in one.endings]
+        said = f"{path}: voxels of {' x '.join(f'{edge:g}' for edge in places.edges_mm)} mm"
+        raise LimitError.instead(said, list(places.edges_mm), f"cubes, or {', '.join(allowed)}")
+    if not form.packed:
+        require_bytes(path, 4 * math.prod(places.shape))
     part = path.with_name(f".{path.name}.part{path.suffix}")
     try:
-        yield from form.write(part, path, grid)
+        with room_named(path):
+            yield from form.write(part, path, places)
     finally:
         if part.is_dir():
             shutil.rmtree(part)
@@ -81,11 +96,7 @@ def _format(path: Path) -> VolumeFormat:
 
 def save_volume(volume: Volume, file: File) -> None:
     """See `Volume.save`."""
-    voxel = volume.voxel_xyz
-    if len(set(voxel)) > 1:
-        said = f"voxels of {' x '.join(f'{v:g}' for v in voxel)} mm"
-        raise LimitError.instead(said, list(voxel), "cubes, three equal edges")
-    with volume_writer(Path(file), Grid(volume.shape, voxel[0], volume.center_mm)) as write:
+    with volume_writer(Path(file), VoxelPlaces.of(volume)) as write:
         write(volume.data)
 
 
@@ -100,11 +111,14 @@ def read_volume(file: File) -> Volume:
     form = _format(path)
     try:
         values, voxel, place, first = form.read(path)
+        along_x, along_y, along_z = np.broadcast_to(np.asarray(voxel, dtype=float), 3).tolist()
+        edges = along_x, along_y, along_z
         if first:  # the place is that of the first voxel
-            sizes = reversed(values.shape)
-            place = [float(p) + (n - 1) / 2 * voxel for p, n in zip(place, sizes, strict=True)]
+            sizes = [*reversed(values.shape)]
+            place = [float(p) + (n - 1) / 2 * edge
+                     for p, n, edge in zip(place, sizes, edges, strict=True)]  # fmt: skip
         x, y, z = (float(p) for p in place)
-        return Volume(values, float(voxel), (x, y, z))
+        return Volume(values, edges, (x, y, z))
     except (ValueError, KeyError, TypeError, AttributeError, IndexError):
         raise LimitError(
             f"{path}: not a volume of flexdt reconstruct", {"file": str(path)}

@@ -18,10 +18,13 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.library.extras import extension, package
+from flexdt.twin.errors import GeometryError
 from flexdt.twin.projection import Grid
+from flexdt.twin.projection.volume import edges_xyz
 
 if TYPE_CHECKING:
     from flexdt.twin.geometry.conventions import Float32Array
+    from flexdt.twin.projection import Volume
 
 HEADER_BYTES: Final = 4096
 """In which the header of a file that has one must end."""
@@ -34,8 +37,55 @@ BIG_TIFF_BYTES: Final = 3 << 30
 
 Sink = Callable[["Float32Array"], None]
 """Takes slabs (k, ny, nx) of layers from low z to high."""
-Stored = tuple[npt.NDArray[Any], float, Sequence[float], bool]
-"""Values, voxel [mm], place (x, y, z) [mm], and whether that is the first voxel's or the middle."""
+Stored = tuple[npt.NDArray[Any], float | Sequence[float], Sequence[float], bool]
+"""Values, edge or edges (x, y, z) of a voxel [mm], place (x, y, z) [mm], and whether that is the
+first voxel's or the middle."""
+
+
+@dataclass(frozen=True)
+class VoxelPlaces:
+    """Where the voxels of a file lie.
+
+    Attributes:
+        shape: (nz, ny, nx).
+        edges_mm: of a voxel, (x, y, z) [mm].
+        center_mm: (x, y, z) of the middle [mm].
+    """
+
+    shape: tuple[int, int, int]
+    edges_mm: tuple[float, float, float]
+    center_mm: tuple[float, float, float]
+
+    @classmethod
+    def of(cls, grid: Grid | Volume) -> VoxelPlaces:
+        """Take those of a grid, or of a volume."""
+        return cls(grid.shape, edges_xyz(grid.voxel_mm), grid.center_mm)
+
+    @property
+    def cubes(self) -> bool:
+        """Whether the three edges of a voxel are equal."""
+        return len(set(self.edges_mm)) == 1
+
+    @property
+    def grid(self) -> Grid:
+        """Give the grid of cubes.
+
+        Raises:
+            GeometryError: they are no cubes.
+        """
+        if not self.cubes:
+            said = f"voxels of {' x '.join(f'{edge:g}' for edge in self.edges_mm)} mm"
+            raise GeometryError.instead(said, list(self.edges_mm), "cubes, three equal edges")
+        return Grid(self.shape, self.edges_mm[0], self.center_mm)
+
+    @property
+    def first_mm(self) -> list[float]:
+        """Centre of the first voxel, (x, y, z) [mm]."""
+        counts = reversed(self.shape)
+        return [
+            middle - (n - 1) / 2 * edge
+            for middle, n, edge in zip(self.center_mm, counts, self.edges_mm, strict=True)
+        ]
 
 
 @dataclass(frozen=True)
@@ -44,35 +94,41 @@ class VolumeFormat:
 
     Attributes:
         endings: of its files, in lower case; the first is the usual one.
-        write: from (unfinished file, final path, grid): yields what takes the slabs; afterwards the
-            unfinished file is whole and gets its final path.
+        write: from (unfinished file, final path, places): yields what takes the slabs; afterwards
+            the unfinished file is whole and gets its final path.
         read: from a path; ValueError and its like where the file is of another kind.
         require: raises TwinError where a package that the format needs is not installed.
+        oblong: whether its voxels may have three edges.
+        packed: whether it is compressed, so that its size is not known before.
     """
 
     endings: tuple[str, ...]
-    write: Callable[[Path, Path, Grid], Iterator[Sink]]
+    write: Callable[[Path, Path, VoxelPlaces], Iterator[Sink]]
     read: Callable[[Path], Stored]
     require: Callable[[], object] = lambda: None
+    oblong: bool = False
+    packed: bool = False
 
 
-def _renamed(write: Callable[[Path, Grid], Iterator[Sink]]) -> Callable[..., Iterator[Sink]]:
-    """Writes one file, which then gets its final path."""
+def _renamed(
+    write: Callable[[Path, VoxelPlaces], Iterator[Sink]],
+) -> Callable[..., Iterator[Sink]]:
+    """Write one file, which then gets its final path."""
 
-    def whole(part: Path, path: Path, grid: Grid) -> Iterator[Sink]:
-        yield from write(part, grid)
+    def whole(part: Path, path: Path, places: VoxelPlaces) -> Iterator[Sink]:
+        yield from write(part, places)
         os.replace(part, path)
 
     return whole
 
 
 def _headed(
-    header: Callable[[Grid], bytes], compress: bool = False
+    header: Callable[[VoxelPlaces], bytes], compress: bool = False
 ) -> Callable[..., Iterator[Sink]]:
-    """Writes a header and the values after it."""
+    """Write a header and the values after it."""
 
-    def write(part: Path, grid: Grid) -> Iterator[Sink]:
-        first = header(grid)
+    def write(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
+        first = header(places)
         with gzip.open(part, "wb", compresslevel=1) if compress else part.open("wb") as file:
             file.write(first)
             yield _raw(file)
@@ -95,9 +151,11 @@ def _blocks(slab: Float32Array) -> Iterator[Float32Array]:
         yield np.ascontiguousarray(slab[first : first + layers], dtype="<f4")
 
 
-def _write_tiff(part: Path, grid: Grid) -> Iterator[Sink]:
+def _write_tiff(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
+    """Write a page for each layer, with voxel and place in the first page's description."""
     import tifffile
 
+    grid = places.grid
     about = {
         "unit": "1/mm",
         "axes": "zyx",
@@ -125,40 +183,33 @@ def _write_tiff(part: Path, grid: Grid) -> Iterator[Sink]:
         yield write
 
 
-def _low(grid: Grid) -> list[float]:
-    """Centre of the first voxel, (x, y, z) [mm]."""
-    nz, ny, nx = grid.shape
-    return [
-        c - (n - 1) / 2 * grid.voxel_mm for c, n in zip(grid.center_mm, (nx, ny, nz), strict=True)
-    ]
-
-
-def _nrrd_header(grid: Grid) -> bytes:
-    nz, ny, nx = grid.shape
-    v = f"{grid.voxel_mm:.9g}"
+def _nrrd_header(places: VoxelPlaces) -> bytes:
+    """Write NRRD's fields; axes point right, front and up."""
+    nz, ny, nx = places.shape
+    x, y, z = (f"{edge:.9g}" for edge in places.edges_mm)
     lines = (
         "NRRD0004",
         "type: float",
         "dimension: 3",
         "space: right-anterior-superior",
         f"sizes: {nx} {ny} {nz}",
-        f"space directions: ({v},0,0) (0,{v},0) (0,0,{v})",
+        f"space directions: ({x},0,0) (0,{y},0) (0,0,{z})",
         "kinds: domain domain domain",
         "endian: little",
         "encoding: raw",
-        "space origin: ({:.9g},{:.9g},{:.9g})".format(*_low(grid)),
+        "space origin: ({:.9g},{:.9g},{:.9g})".format(*places.first_mm),
     )
     return ("\n".join(lines) + "\n\n").encode("ascii")
 
 
-def _mha_header(grid: Grid) -> bytes:
-    """MetaImage, header and data in one file.
+def _mha_header(places: VoxelPlaces) -> bytes:
+    """Write MetaImage, header and data in one file.
 
     ITK takes its axes to point left, back and up, so x and y are turned: the place is then that of
     the NRRD and NIfTI files.
     """
-    nz, ny, nx = grid.shape
-    x, y, z = _low(grid)
+    nz, ny, nx = places.shape
+    x, y, z = places.first_mm
     fields = {
         "ObjectType": "Image",
         "NDims": "3",
@@ -168,7 +219,7 @@ def _mha_header(grid: Grid) -> bytes:
         "TransformMatrix": "-1 0 0 0 -1 0 0 0 1",
         "Offset": " ".join(repr(float(place)) for place in (-x, -y, z)),
         "CenterOfRotation": "0 0 0",
-        "ElementSpacing": " ".join([repr(float(grid.voxel_mm))] * 3),
+        "ElementSpacing": " ".join(repr(float(edge)) for edge in places.edges_mm),
         "DimSize": f"{nx} {ny} {nz}",
         "ElementType": "MET_FLOAT",
         "ElementDataFile": "LOCAL",
@@ -176,12 +227,12 @@ def _mha_header(grid: Grid) -> bytes:
     return "".join(f"{key} = {value}\n" for key, value in fields.items()).encode("ascii")
 
 
-def _nifti_header(grid: Grid) -> bytes:
-    """NIfTI-1: x to the right, y to the front, z up; data from byte 352 on."""
+def _nifti_header(places: VoxelPlaces) -> bytes:
+    """Write NIfTI-1's: x to the right, y to the front, z up; data from byte 352 on."""
     nibabel = _nibabel()
-    nz, ny, nx = grid.shape
-    affine = np.diag([grid.voxel_mm] * 3 + [1.0])
-    affine[:3, 3] = _low(grid)
+    nz, ny, nx = places.shape
+    affine = np.diag([*places.edges_mm, 1.0])
+    affine[:3, 3] = places.first_mm
     header = nibabel.Nifti1Header(endianness="<")
     header.set_data_dtype(np.float32)
     header.set_data_shape((nx, ny, nz))
@@ -194,8 +245,9 @@ def _nifti_header(grid: Grid) -> bytes:
     return block + bytes(NIFTI_DATA_BYTE - len(block))
 
 
-def _write_hdf5(part: Path, grid: Grid) -> Iterator[Sink]:
-    """One data set, `volume`, with its place as attributes."""
+def _write_hdf5(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
+    """Write one data set, `volume`, with its place as attributes."""
+    grid = places.grid
     with _h5py().File(part, "w") as file:
         values = file.create_dataset("volume", grid.shape, "f4")
         values.attrs.update(unit="1/mm", axes="zyx", voxel_mm=grid.voxel_mm,
@@ -229,9 +281,10 @@ def _mapped(path: Path, offset: int, sizes: str) -> npt.NDArray[np.float32]:
 def _read_nrrd(path: Path) -> Stored:
     fields, begin = _header(path, ":", b"\n\n")
     values = _mapped(path, begin, fields["sizes"])
-    voxel = float(fields["space directions"].split(",")[0].strip("("))
+    rows = fields["space directions"].split()
+    edges = [float(row.strip("()").split(",")[i]) for i, row in enumerate(rows)]
     low = [float(v) for v in fields["space origin"].strip("()").split(",")]
-    return values, voxel, low, True
+    return values, edges, low, True
 
 
 def _read_tiff(path: Path) -> Stored:
@@ -248,13 +301,13 @@ def _read_mha(path: Path) -> Stored:
     values = _mapped(path, begin, fields["DimSize"])
     x, y, z = (float(v) for v in fields["Offset"].split())
     low = [-x, -y, z]
-    return values, float(fields["ElementSpacing"].split()[0]), low, True
+    return values, [float(edge) for edge in fields["ElementSpacing"].split()], low, True
 
 
 def _read_nifti(path: Path) -> Stored:
     image = _nibabel().load(path)
     values = np.asarray(image.dataobj, dtype=np.float32).T
-    return values, float(image.affine[0, 0]), image.affine[:3, 3], True
+    return values, np.diag(image.affine)[:3].tolist(), image.affine[:3, 3], True
 
 
 def _read_hdf5(path: Path) -> Stored:
@@ -276,8 +329,9 @@ def _zarr() -> Any:
     return extension("zarr", "a volume in .zarr")
 
 
-def _write_zarr(part: Path, path: Path, grid: Grid) -> Iterator[Sink]:
-    yield from _zarr().write(part, path, grid)
+def _write_zarr(part: Path, path: Path, places: VoxelPlaces) -> Iterator[Sink]:
+    """Write what the extension writes."""
+    yield from _zarr().write(part, path, places.grid)
 
 
 def _read_zarr(path: Path) -> Stored:
@@ -287,10 +341,17 @@ def _read_zarr(path: Path) -> Stored:
 
 VOLUME_FORMATS: Final = (
     VolumeFormat((".tif", ".tiff"), _renamed(_write_tiff), _read_tiff),
-    VolumeFormat((".nrrd",), _headed(_nrrd_header), _read_nrrd),
-    VolumeFormat((".mha",), _headed(_mha_header), _read_mha),
-    VolumeFormat((".nii.gz",), _headed(_nifti_header, compress=True), _read_nifti, _nibabel),
+    VolumeFormat((".nrrd",), _headed(_nrrd_header), _read_nrrd, oblong=True),
+    VolumeFormat((".mha",), _headed(_mha_header), _read_mha, oblong=True),
+    VolumeFormat(
+        (".nii.gz",),
+        _headed(_nifti_header, compress=True),
+        _read_nifti,
+        _nibabel,
+        oblong=True,
+        packed=True,
+    ),
     VolumeFormat((".h5",), _renamed(_write_hdf5), _read_hdf5, _h5py),
-    VolumeFormat((".zarr",), _write_zarr, _read_zarr, _zarr),
+    VolumeFormat((".zarr",), _write_zarr, _read_zarr, _zarr, packed=True),
 )
 """In the order in which they are listed."""

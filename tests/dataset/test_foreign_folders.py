@@ -1,0 +1,80 @@
+"""Folders and images of other programs: read, or the way to read them is said."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+
+import flexdt as fx
+from flexdt.twin.dataset.dataset_errors import DatasetError
+
+VIEWS, SHAPE = 3, (6, 8)
+SCAN = fx.ConeVec.circular(sod=100, sdd=200, angles=VIEWS, pixel=0.2)
+
+
+def images(kind: str) -> np.ndarray[Any, Any]:
+    rng = np.random.default_rng(7)
+    return rng.integers(20, 120, (VIEWS, *SHAPE)).astype(kind)
+
+
+@pytest.mark.parametrize("kind", ["u1", "u2", "i2"])
+def test_counts_of_these_kinds_are_read(tmp_path: Path, kind: str) -> None:
+    for i, image in enumerate(images(kind)):
+        tifffile.imwrite(tmp_path / f"p{i}.tif", image)
+    tifffile.imwrite(tmp_path / "io0.tif", np.full(SHAPE, 120, kind))
+    data = fx.read_tiffs(tmp_path, SCAN)
+    np.testing.assert_array_equal(data.counts(), images(kind).astype(np.uint16))
+    assert data.counts().dtype == np.uint16
+
+
+def test_counts_below_zero_are_refused(tmp_path: Path) -> None:
+    low = images("i2")
+    low[0, 2, 3] = -5
+    for i, image in enumerate(low):
+        tifffile.imwrite(tmp_path / f"p{i}.tif", image)
+    with pytest.raises(DatasetError, match=r"holds counts down to -5; allowed: 0 or more"):
+        fx.read_tiffs(tmp_path, SCAN)
+
+
+@pytest.mark.parametrize("door", ["file", "folder"])
+def test_several_images_in_one_file_have_a_way(tmp_path: Path, door: str) -> None:
+    file = tmp_path / "all.tif"
+    tifffile.imwrite(file, images("u2"), photometric="minisblack")
+    with pytest.raises(DatasetError) as told:
+        fx.read_tiffs(file if door == "file" else tmp_path, SCAN)
+    way = "fx.DataSet.from_arrays(tifffile.imread(FILE), geometry)"
+    assert way in str(told.value)
+    found = eval(way.replace("FILE", "file"),
+                 {"fx": fx, "tifffile": tifffile, "file": file, "geometry": SCAN})  # fmt: skip
+    np.testing.assert_array_equal(found.counts(), images("u2"))
+
+
+def test_a_folder_with_one_scan_of_another_program_is_opened(tmp_path: Path) -> None:
+    """As the file itself; with two of them the folder says how each is opened."""
+    said = {
+        "Name": "bolt", "Projections": VIEWS, "SrcToObject": 100, "SrcToDetector": 200,
+        "DetectorPixelsX": SHAPE[1], "DetectorPixelsY": SHAPE[0], "DetectorPixelSizeX": 0.2,
+        "DetectorPixelSizeY": 0.2, "AngularStep": 120, "WhiteLevel": 60000,
+    }  # fmt: skip
+    text = "[XTekCT]\n" + "".join(f"{key}={value}\n" for key, value in said.items())
+    (tmp_path / "bolt.xtekct").write_text(text)
+    for i, image in enumerate(images("u2")):
+        tifffile.imwrite(tmp_path / f"bolt_{i + 1:04d}.tif", image)
+    data = fx.open(tmp_path)
+    np.testing.assert_array_equal(data.counts(), images("u2"))
+    np.testing.assert_array_equal(
+        data.geometry.rows, fx.open(tmp_path / "bolt.xtekct").geometry.rows
+    )
+    (tmp_path / "other.xtekct").write_text(text)
+    with pytest.raises(
+        DatasetError, match=r"it holds a scan of Nikon: fx\.open\('.*bolt\.xtekct'\)"
+    ):
+        fx.open(tmp_path)
+    for file in tmp_path.glob("*.xtekct"):
+        file.unlink()
+    with pytest.raises(DatasetError, match=r"of 3 other TIFFs: fx\.read_tiffs\(FOLDER, geometry\)"):
+        fx.open(tmp_path)
