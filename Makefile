@@ -4,6 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+BASE_STAMP := $(VENV)/.installed-base
 COMPILED := $(VENV)/.compiled
 TEST_STAMP := $(VENV)/.installed-test
 DOCS_STAMP := $(VENV)/.installed-docs
@@ -27,11 +28,18 @@ unexport PYTHONDONTWRITEBYTECODE
 
 install: $(COMPILED)
 
+# What a user installs: nothing of a developer's tools. Where those are there already, nothing is done.
+$(BASE_STAMP): pyproject.toml extensions/pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt \
+	  -e . -e extensions
+	touch $@
+
 $(STAMP): pyproject.toml extensions/pyproject.toml constraints.txt
-	$(PYTHON) -m venv $(VENV)
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt \
 	  -e '.[dev]' -e extensions
-	touch $@
+	touch $(BASE_STAMP) $@
 
 # The kernels, on all cores. The demonstration compiles its own while it starts and scans.
 $(COMPILED): $(STAMP)
@@ -55,7 +63,7 @@ $(WEB_STAMP): $(TEST_STAMP) $(WEB)/package-lock.json
 	@(PATH="$(CURDIR)/$(BIN):$$PATH" npm ci --prefix $(WEB) --no-audit --no-fund --silent --fetch-retries=1 && touch $@) \
 	  || echo "npm could not install TypeScript and eslint: the page's source is not checked"
 
-demo: $(STAMP)
+demo: $(BASE_STAMP)
 	$(BIN)/flexdt demo --no-viewer
 
 lint: $(LINTED)

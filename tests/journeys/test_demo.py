@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import itertools
 import json
+import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -14,6 +16,7 @@ import numpy as np
 import pytest
 import tifffile
 
+from flexdt.clients.cli.command_tree import run
 from flexdt.library.reading.folders import load_dataset
 from flexdt.twin.geometry.offsets import Offsets
 
@@ -48,6 +51,23 @@ def test_it_ends_well_and_says_what_it_did(
     assert document["frames"] == 360
     assert 0 < document["scan_s"] < 180
     assert document["truth"] == TRUTH
+    verdict = document["calibration"]["verdict"]
+    assert f"verdict: {verdict}" in process.stderr
+    assert (out / "demo.png").read_bytes().startswith(b"\x89PNG")
+    assert document["picture"] == str(out / "demo.png")
+    assert not re.search(r"still .*\(0 s", process.stderr)
+
+
+@pytest.mark.slow
+def test_its_next_commands_are_commands(
+    done: tuple[subprocess.CompletedProcess[str], Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    process, out = done
+    lines = process.stderr.split("next:\n")[1].splitlines()[:2]
+    first, second = (shlex.split(line, comments=True)[1:] for line in lines)
+    assert run(first) == 0, capsys.readouterr().err
+    assert (out / "volume.nrrd").stat().st_size > 0
+    assert (second[:2], Path(second[2])) == (["up", "--data"], out / "data")
 
 
 @pytest.mark.slow

@@ -16,6 +16,8 @@ from flexdt.clients.cli.command_tree import run
 from flexdt.clients.launch.processes import Servers
 
 pytestmark = pytest.mark.slow
+COLLISION = 3
+"""Exit code of a check that finds one."""
 
 README = (Path(__file__).resolve().parents[2] / "README.md").read_text()
 
@@ -24,6 +26,12 @@ def shell_lines() -> list[str]:
     blocks = re.findall(r"```sh\n(.*?)```", README, re.DOTALL)
     text = "".join(blocks).replace("\\\n", " ")
     return [line.partition(" #")[0].strip() for line in text.splitlines()]
+
+
+def promises() -> dict[str, tuple[int, str]]:
+    """Commands with the line and the words that the comment behind them promises."""
+    found = re.findall(r"^flexdt (.+?) +# line (\d+): (.+)$", README, re.MULTILINE)
+    return {command: (int(line), what) for command, line, what in found}
 
 
 def netcat(address: tuple[str, int], text: str) -> list[Any]:
@@ -57,7 +65,14 @@ def test_the_five_minutes(
     for words in commands:
         names.add(words[0])
         server = ["--server", "{}:{}".format(*servers.address)] if words[0] in talking else []
-        assert run([*words, *server]) == 0, (words, capsys.readouterr().err)
+        promised = promises().get(shlex.join(words))
+        code = run([*words, *server])
+        told = capsys.readouterr().err
+        assert code == (COLLISION if promised and "detector-too-near" in words[1] else 0), told
+        if promised is not None:
+            line, what = promised
+            assert re.search(rf"{re.escape(words[1])}:{line}:\d+: .*{re.escape(what)}", told), told
+    assert len(promises()) == 2
     assert talking | {"check", "script"} <= names
     assert (here / "view.png").read_bytes().startswith(b"\x89PNG")
     assert (here / "report.html").is_file()

@@ -8,13 +8,16 @@ from the document.
 from __future__ import annotations
 
 import contextlib
+import shlex
+import shutil
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from datetime import datetime
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from flexdt.clients.cli.boundary import NOT_IDENTIFIABLE
 from flexdt.clients.cli.commands.calibrate_commands import (
@@ -37,6 +40,12 @@ if TYPE_CHECKING:
 
 SAMPLE: Final = "lego"
 SCRIPT: Final = "lego-fly-360.txt"
+PROGRAM: Final = "flexdt"
+"""The command, where it is on the path."""
+CALIBRATION: Final = "calibration.json"
+PICTURE: Final = "demo.png"
+PICTURE_ROWS: Final = 380
+"""Height of the picture [pixels]."""
 STAY_S: Final = 3600.0
 """Longest sleep while the lab stays up; Ctrl-C ends it at once."""
 Tell = Callable[[str], None]
@@ -74,7 +83,7 @@ def demo(
 
 def run_demo(
     out: Path, truth_file: Path | None, tell: Tell, stay: Callable[[str], None] | None = None
-) -> dict[str, object]:
+) -> dict[str, Any]:
     """Run every stage there is.
 
     Args:
@@ -106,7 +115,8 @@ def run_demo(
         with TwinClient(*servers.address) as client:
             document = _main_job(client, compiling.wait, truth, out, tell)
         write_json(out / "demo.json", document)
-        tell(f"summary: {out / 'demo.json'}")
+        write_json(out / CALIBRATION, document["calibration"])
+        _told_the_end(document, out, tell)
         if stay is not None and servers.viewer_url is not None:
             stay(servers.viewer_url)
     return document
@@ -146,7 +156,7 @@ def _main_job(
     truth: Mapping[str, float],
     out: Path,
     tell: Tell,
-) -> dict[str, object]:
+) -> dict[str, Any]:
     """Scan, calibrate, put the correction in force and preview; returns the document.
 
     Args:
@@ -161,7 +171,7 @@ def _main_job(
         compiled()
     begun = time.monotonic()
     outcome = _calibrated(dataset, tell)
-    document = {
+    document: dict[str, Any] = {
         "dataset": str(dataset.folder),
         "frames": len(dataset.frames),
         "scan_s": round(seconds, 3),
@@ -173,6 +183,7 @@ def _main_job(
     tell(f"correction in force on the twin: {outcome.correction.name}")
     document["inside_95"] = _compared(outcome, truth, tell)
     document["preview"] = _previewed(dataset, outcome, out / "preview.tif", tell)
+    document["picture"] = str(_pictured(dataset, out / "preview.tif", out / PICTURE))
     return document
 
 
@@ -238,6 +249,50 @@ def _previewed(
         document = preview(dataset, out, parameters=fit.parameters)
     tell(f"preview {out}: {duration(document['seconds'])}")
     return document
+
+
+def _pictured(dataset: DataSet, volume: Path, out: Path) -> Path:
+    """Draw the first radiograph beside the middle layer of a volume, equally high.
+
+    Args:
+        dataset: of the radiograph.
+        volume: file of the volume.
+        out: where the PNG goes.
+
+    Returns:
+        `out`.
+    """
+    import numpy as np
+
+    from flexdt.library.datasets.pictures import png_of, windowed
+    from flexdt.library.reconstruction.volume_files import read_volume
+
+    layers = read_volume(volume).data
+    images = dataset.line_integrals(0), layers[len(layers) // 2][::-1]
+    drawn = []
+    for image in images:
+        places = (np.arange(PICTURE_ROWS) * image.shape[0]) // PICTURE_ROWS
+        cols = round(PICTURE_ROWS * image.shape[1] / image.shape[0])
+        across = (np.arange(cols) * image.shape[1]) // cols
+        drawn.append(windowed(np.asarray(image)[np.ix_(places, across)]))
+    out.write_bytes(png_of(np.hstack(drawn)))
+    return out
+
+
+def _told_the_end(document: dict[str, Any], out: Path, tell: Tell) -> None:
+    """Say the verdict, where the picture is, and what to do next."""
+    program = PROGRAM if shutil.which(PROGRAM) else sys.argv[0]
+    dataset = shlex.quote(document["dataset"])
+    folder = shlex.quote(str(out))
+    tell(f"verdict: {document['calibration']['verdict']}")
+    tell(f"picture: {document['picture']} (the first radiograph, and a layer of the volume)")
+    tell(f"summary: {out / 'demo.json'}")
+    tell("next:")
+    tell(
+        f"  {program} reconstruct {dataset} --correction {folder}/{CALIBRATION} --binning 4 --png "
+        f"--out {folder}/volume.nrrd"
+    )
+    tell(f"  {program} up --data {folder}/data   # the lab in the browser, until Ctrl-C")
 
 
 def _compared(outcome: Outcome[DataSet], truth: Mapping[str, float], tell: Tell) -> bool:

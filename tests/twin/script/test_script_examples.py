@@ -69,7 +69,7 @@ def test_the_demo_s_script(check: CheckReport, flexray: Machine, profile: Profil
 
 def test_scripts_keep_the_scanner_s_line_ends() -> None:
     files = sorted(FOLDER.glob("*.txt"))
-    assert len(files) >= 6
+    assert len(files) >= 7
     for file in files:
         data = file.read_bytes()
         if file.stem != "listing1":
