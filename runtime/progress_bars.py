@@ -40,14 +40,14 @@ def shown_on(log: logging.Logger) -> Shown:
     """
     if log.hasHandlers():
         return Lines(log)
-    if _notebook():
+    if in_notebook():
         return NotebookBar()
     if sys.stderr is not None and sys.stderr.isatty():
         return TerminalBar()
     return Lines(log)
 
 
-def _notebook() -> bool:
+def in_notebook() -> bool:
     """Whether this process is the kernel of a notebook."""
     shell: Any = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     return getattr(shell, "kernel", None) is not None

@@ -22,6 +22,7 @@ from flexdt.twin.signatures import File, public, with_options_of
 if TYPE_CHECKING:
     from flexdt.library.calibration.align_dataset import Aligned
     from flexdt.library.calibration.calibrate import Outcome
+    from flexdt.library.notebook_pages import NotebookPage
     from flexdt.phantoms import Phantom
     from flexdt.twin.physics.tube import Tube
     from flexdt.twin.projection import Volume
@@ -230,6 +231,27 @@ class DataSet(ImageSet):
         from flexdt.library.xarray_forms import images_to_xarray
 
         return images_to_xarray(self)
+
+    def show(self) -> NotebookPage:
+        """Show projections behind a slider, and the sinogram of the middle row, in a notebook.
+
+        The page needs no package; `.save("scan.html")` writes it.
+
+        Raises:
+            DatasetError: an image cannot be read.
+            TwinError: there is no projection.
+
+        Example:
+            >>> import numpy as np
+            >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
+            >>> counts, flat = np.full((3, 4, 5), 500), np.full((4, 5), 1000)
+            >>> data = DataSet.from_arrays(counts, scan, flat=flat)
+            >>> "sinogram" in data.show().html
+            True
+        """
+        from flexdt.library.notebook_pages import data_page
+
+        return data_page(self)
 
     def plot(self, index: int = 0, axes: Any = None) -> Any:
         """Show one projection's line integrals; needs matplotlib (the extra `plots`).

@@ -41,6 +41,7 @@ def plot_geometry(cone_vec: ConeVec, axes: Any = None) -> Any:
     axes.plot(*cone_vec.detector.T, "C1.", markersize=2, label="detector")
     axes.plot([0.0], [0.0], [0.0], "k+", label="origin of the object")
     axes.set(xlabel="x [mm]", ylabel="y [mm]", zlabel="z [mm]", title=f"{len(cone_vec)} views")
+    axes.set_aspect("equal")
     axes.legend()
     return axes
 

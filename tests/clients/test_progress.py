@@ -41,7 +41,7 @@ def screen(monkeypatch: pytest.MonkeyPatch) -> Terminal:
     monkeypatch.setattr(progress_lines, "SILENT_S", 0.05)
     monkeypatch.setattr(progress_lines, "DRAWN_S", 0.02)
     monkeypatch.setattr(progress_lines, "_last", {})
-    monkeypatch.setattr(progress_bars, "_notebook", lambda: False)
+    monkeypatch.setattr(progress_bars, "in_notebook", lambda: False)
     monkeypatch.setattr(progress_lines.LOG, "hasHandlers", lambda: False)
     return shown
 

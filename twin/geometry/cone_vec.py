@@ -563,6 +563,21 @@ class ConeVec:
         """
         return replace(self, detector_shape=shape)
 
+    def show(self) -> Any:
+        """Show source, panel and sample of each view in a notebook, with a slider for the view.
+
+        All axes have one scale. The page needs no package; `.save("geometry.html")` writes it.
+
+        Returns:
+            What a notebook shows.
+
+        Example:
+            >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
+            >>> "view 3 of 4" in scan.show().html
+            True
+        """
+        return backend("notebook pages").geometry_page(self)
+
     def plot(self, axes: Any = None) -> Any:
         """Plot source, detector and rays in three dimensions; needs matplotlib
         (the extra `plots`).

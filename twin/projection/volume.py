@@ -9,6 +9,7 @@ use, and kept.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from html import escape
@@ -305,6 +306,28 @@ class Volume:
             'z = 0.25 mm'
         """
         return backend("plots").plot_volume(self, axes, what)
+
+    def show(self, window: Sequence[float] | None = None) -> Any:
+        """Show three slices in a notebook, with a slider for each.
+
+        With ipywidgets (the extra `notebook`) every layer and any window can be chosen; without it
+        it is a page of HTML with some layers, which `.save("volume.html")` writes.
+
+        Args:
+            window: attenuation of black and of white [1/mm]; None: percentiles of the volume.
+
+        Returns:
+            What a notebook shows.
+
+        Raises:
+            TwinError: a window that is none.
+
+        Example:
+            >>> page = Volume(np.zeros((6, 4, 4)), voxel_mm=0.5).show()
+            >>> "z = 0.25 mm" in page.html
+            True
+        """
+        return backend("notebook pages").show_volume(self, window)
 
     def to_xarray(self) -> Any:
         """The values as an xarray DataArray (z, y, x) with positions [mm], which needs xarray.

@@ -1,0 +1,365 @@
+"""Show volumes, data sets and geometries in a notebook, with sliders: pages of HTML by themselves.
+
+The pages need no package and no server: the images are in them, and a slider shows one of them.
+They are kept when a notebook is saved, and `save` writes them as files. `notebook_widgets` shows
+volumes live where ipywidgets is installed.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.library.datasets.pictures import PERCENTILES, png_of
+from flexdt.library.extras import lacking, package
+from flexdt.runtime.files.whole_files import write_whole
+from flexdt.runtime.progress_bars import in_notebook
+from flexdt.twin.errors import TwinError
+
+if TYPE_CHECKING:
+    from flexdt.library.datasets.image_set import ImageSet
+    from flexdt.twin.geometry.cone_vec import ConeVec
+    from flexdt.twin.projection import Volume
+
+MOST_PICTURES: Final = 24
+"""Pictures behind a slider; of more, so many are taken, evenly spread."""
+MOST_VALUES: Final = 1_000_000
+"""Of which percentiles are taken; of more, about so many are taken, evenly spread."""
+SIDE_PX: Final = 220
+"""Longest side of a picture."""
+DRAWING_PX: Final = 420
+"""Side of the drawing of a geometry."""
+MARGIN: Final = 0.06
+"""Of the drawing's side, left free around a geometry."""
+ELEVATION_DEG: Final = 30.0
+"""Of the eye above the plane of the turn, in the drawing of a geometry."""
+PANEL_CORNERS: Final = ((-0.5, -0.5), (-0.5, 0.5), (0.5, 0.5), (0.5, -0.5))
+"""Of a panel, in parts of its rows and columns from its centre."""
+AXES: Final = (("z", 0, "xy"), ("y", 1, "xz"), ("x", 2, "yz"))
+"""Name of an axis, its place in the data, and the axes of its layers (to the right, up)."""
+NOT_DRAWN: Final = ' style="display:none"'
+HIDE_DRAWN: Final = "e.style.display = i == this.value ? '' : 'none'"
+"""As `hidden`, which SVG does not know."""
+SHOW_CHOSEN: Final = (
+    "for (const [i, e] of [...this.parentNode.querySelectorAll('[data-of]')].entries()) "
+    "e.hidden = i != this.value; this.nextElementSibling.textContent = "
+    "this.parentNode.querySelectorAll('[data-of]')[this.value].dataset.of"
+)
+"""What a slider does: shows the chosen one of the pictures beside it, and its name."""
+
+
+@dataclass(frozen=True)
+class NotebookPage:
+    """What `show` gives: a notebook shows it, and `save` writes it.
+
+    Attributes:
+        html: the page's content, without `html` and `body`.
+        title: of a file that it is saved to.
+    """
+
+    html: str
+    title: str
+
+    def _repr_html_(self) -> str:
+        return self.html
+
+    def __repr__(self) -> str:
+        return f"<NotebookPage of {self.title}: {len(self.html) >> 10} kB of HTML>"
+
+    def save(self, file: Any) -> None:
+        """Write it as an HTML file that needs nothing else.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        head = f'<!doctype html><meta charset="utf-8"><title>{escape(self.title)}</title>'
+        write_whole(Path(file), f"{head}\n{self.html}\n")
+
+
+def show_volume(volume: Volume, window: Sequence[float] | None = None) -> Any:
+    """See `Volume.show`."""
+    if in_notebook() and lacking("ipywidgets", "ipywidgets", "notebook") is None:
+        from flexdt.library.notebook_widgets import volume_widgets
+
+        widgets = package("ipywidgets", "a volume with live sliders", "notebook")
+        return volume_widgets(widgets, volume, window)
+    return volume_page(volume, window)
+
+
+def volume_page(volume: Volume, window: Sequence[float] | None = None) -> NotebookPage:
+    """Show the layers of a volume along its three axes, a slider for each.
+
+    Args:
+        volume: is seen from above, from the front and from the right.
+        window: attenuation of black and of white [1/mm]; None: percentiles of the volume.
+
+    Raises:
+        TwinError: a window that is none.
+    """
+    low, high = window_of(volume.data, window)
+    data, centers = volume.data, volume.centers()
+    parts = []
+    for name, axis, across in AXES:
+        places = centers["xyz".index(name)]
+        shown = _some(len(places))
+        pictures = [
+            (f"{name} = {places[i]:.4g} mm", _grey(layer_of(data, axis, i), low, high))
+            for i in shown
+        ]
+        sizes = [volume.voxel_xyz["xyz".index(one)] for one in across]
+        middle = len(pictures) // 2
+        parts.append(_sliding(pictures, f"across {name}", sizes[1] / sizes[0], middle))
+    caption = f"{volume!r}".strip("<>")
+    return NotebookPage(
+        _row(parts) + f"<div>{escape(caption)}; black {low:.4g}, white {high:.4g} 1/mm</div>",
+        caption,
+    )
+
+
+def layer_of(data: npt.NDArray[Any], axis: int, index: int) -> npt.NDArray[Any]:
+    """Give one layer of a volume (nz, ny, nx), the last axis to the right and the other up.
+
+    Args:
+        data: the volume's values.
+        axis: 0 for z, 1 for y, 2 for x.
+        index: of the layer along it.
+    """
+    layer: npt.NDArray[Any] = np.take(data, index, axis)[::-1]
+    return layer
+
+
+def data_page(data: ImageSet) -> NotebookPage:
+    """Show the projections of a data set behind a slider, and the sinogram of its middle row.
+
+    Args:
+        data: line integrals are shown, or counts where there is no flat image.
+
+    Raises:
+        DatasetError: an image cannot be read.
+    """
+    present = data.present
+    has_flat = bool(data.flats) or (data.arrays is not None and data.arrays.flats is not None)
+    read = data.line_integrals if has_flat else data.counts
+    chosen = [present[i] for i in _some(len(present))]
+    images = [np.asarray(read(i), dtype=np.float32) for i in chosen]
+    if not images:
+        raise TwinError(f"{data.where}: no projections to show", {"path": data.where})
+    low, high = window_of(np.stack([_small(image) for image in images]), None)
+    what = "line integrals" if has_flat else "counts"
+    pictures = [
+        (f"{i}: {data.frames[i].file}", _grey(image, low, high))
+        for i, image in zip(chosen, images, strict=True)
+    ]
+    middle = data.shape[0] // 2
+    sinogram = np.stack([image[middle] for image in images])
+    tall = np.repeat(sinogram, max(1, SIDE_PX // (2 * len(sinogram))), axis=0)
+    parts = [
+        _sliding(pictures, what),
+        _sliding([(f"row {middle}, views downwards", _grey(tall, low, high))], "sinogram"),
+    ]
+    caption = f"{data!r}".strip("<>")
+    return NotebookPage(_row(parts) + f"<div>{escape(caption)}</div>", caption)
+
+
+def geometry_page(cone_vec: ConeVec) -> NotebookPage:
+    """Draw source, panel and sample of each view, with one scale along all axes.
+
+    Args:
+        cone_vec: views in the object's frame; without a detector's shape the panel is a point.
+    """
+    drawing = _Drawing.of(cone_vec)
+    shown = _some(len(cone_vec))
+    pictures = [
+        f'<g data-of="view {i} of {len(cone_vec)}"{"" if k == 0 else NOT_DRAWN}>'
+        f"{drawing.view(cone_vec, i)}</g>"
+        for k, i in enumerate(shown)
+    ]
+    svg = (
+        f'<svg width="{DRAWING_PX}" height="{DRAWING_PX}" role="img" '
+        f'aria-label="geometry of {len(cone_vec)} views">{drawing.still(cone_vec)}'
+        f"{''.join(pictures)}</svg>"
+    )
+    handler = SHOW_CHOSEN.replace("e.hidden = i != this.value", HIDE_DRAWN)
+    caption = f"{cone_vec!r}".strip("<>")
+    slider = _slider(len(shown), "view", handler, 0)
+    scale = f"{drawing.millimetres:.4g} mm across; red source, orange panel, circle sample"
+    return NotebookPage(
+        f"<div>{svg}<br>{slider}<span>view {shown[0]} of {len(cone_vec)}</span></div>"
+        f"<div>{escape(caption)}; {scale}</div>",
+        caption,
+    )
+
+
+@dataclass(frozen=True)
+class _Drawing:
+    """A parallel projection of the object's frame onto a square.
+
+    Attributes:
+        middle: of what is drawn (x, y, z) [mm].
+        millimetres: along the square's side.
+        radius_mm: of the circle that stands for the sample.
+    """
+
+    middle: npt.NDArray[np.float64]
+    millimetres: float
+    radius_mm: float
+
+    @classmethod
+    def of(cls, cone_vec: ConeVec) -> _Drawing:
+        """Choose the scale at which everything is seen."""
+        ends = np.concatenate([cone_vec.source, cone_vec.detector, np.zeros((1, 3))])
+        if cone_vec.detector_shape is not None:
+            panels = [panel_corners(cone_vec, i) for i in range(len(cone_vec))]
+            ends = np.concatenate([ends, *panels])
+        low, high = ends.min(axis=0), ends.max(axis=0)
+        half = np.linalg.norm(cone_vec.source, axis=1).min()
+        wide = cone_vec.detector_shape or (1, 1)
+        panel = 0.5 * wide[1] * float(np.linalg.norm(cone_vec.u[0]))
+        reach = float(np.linalg.norm(cone_vec.source[0] - cone_vec.detector[0]))
+        return cls(
+            0.5 * (low + high),
+            float(np.linalg.norm(high - low)) * (1.0 + 2.0 * MARGIN),
+            float(half) * panel / max(reach, 1e-9),
+        )
+
+    def point(self, place: npt.ArrayLike) -> tuple[float, float]:
+        """Give the pixel (right, down) of a place (x, y, z) [mm]."""
+        x, y, z = np.asarray(place, dtype=float) - self.middle
+        slope = np.radians(ELEVATION_DEG)
+        up = z * np.cos(slope) + y * np.sin(slope)
+        scale = DRAWING_PX / self.millimetres
+        return DRAWING_PX / 2 + scale * float(x), DRAWING_PX / 2 - scale * float(up)
+
+    def still(self, cone_vec: ConeVec) -> str:
+        """Draw what all views share: places of the source, and the sample."""
+        dots = "".join(
+            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="1" fill="#d33" opacity=".4"/>'
+            for x, y in (self.point(cone_vec.source[i]) for i in _some(len(cone_vec)))
+        )
+        x, y = self.point((0.0, 0.0, 0.0))
+        radius = max(2.0, self.radius_mm * DRAWING_PX / self.millimetres)
+        return dots + (
+            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:.1f}" fill="none" stroke="#456"/>'
+        )
+
+    def view(self, cone_vec: ConeVec, index: int) -> str:
+        """Draw one view: source, central ray and panel."""
+        source, centre = (
+            self.point(place[index]) for place in (cone_vec.source, cone_vec.detector)
+        )
+        corners = [centre]
+        if cone_vec.detector_shape is not None:
+            corners = [self.point(corner) for corner in panel_corners(cone_vec, index)]
+        outline = " ".join(f"{x:.1f},{y:.1f}" for x, y in corners)
+        return (
+            f'<line x1="{source[0]:.1f}" y1="{source[1]:.1f}" x2="{centre[0]:.1f}" '
+            f'y2="{centre[1]:.1f}" stroke="#888" stroke-dasharray="3"/>'
+            f'<polygon points="{outline}" fill="#f80" fill-opacity=".3" stroke="#f80"/>'
+            f'<circle cx="{source[0]:.1f}" cy="{source[1]:.1f}" r="4" fill="#d33"/>'
+        )
+
+
+def panel_corners(cone_vec: ConeVec, index: int) -> npt.NDArray[np.float64]:
+    """Give the corners of a view's panel, (4, 3) [mm].
+
+    Args:
+        cone_vec: with the detector's shape.
+        index: of the view.
+    """
+    rows, cols = cone_vec.detector_shape or (0, 0)
+    centre, u, v = cone_vec.detector[index], cone_vec.u[index], cone_vec.v[index]
+    return np.array([centre + r * rows * v + c * cols * u for r, c in PANEL_CORNERS])
+
+
+def window_of(values: npt.NDArray[Any], window: Sequence[float] | None) -> tuple[float, float]:
+    """Give the values of black and white.
+
+    Args:
+        values: whose percentiles are taken where no window is given; NaN is left out.
+        window: (black, white).
+
+    Raises:
+        TwinError: not two numbers, the first the smaller one.
+    """
+    if window is None:
+        step = max(1, round((values.size / MOST_VALUES) ** (1.0 / values.ndim)))
+        seen = values[(slice(None, None, step),) * values.ndim]
+        seen = seen[np.isfinite(seen)]
+        low, high = np.percentile(seen, PERCENTILES).tolist() if seen.size else (0.0, 1.0)
+        return low, high if high > low else low + 1.0
+    if len(window) != 2 or not window[0] < window[1]:
+        raise TwinError.instead(f"window {window!r}", list(window), "(black, white), black first")
+    return float(window[0]), float(window[1])
+
+
+def _some(count: int) -> list[int]:
+    """Choose indices, evenly spread, of which a slider shows one."""
+    if not count:
+        return []
+    spread = np.linspace(0, count - 1, min(count, MOST_PICTURES))
+    return [int(i) for i in np.unique(spread.round())]
+
+
+def _small(image: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Take every so many pixels of an image, so that no side exceeds SIDE_PX."""
+    step = max(1, -(-max(image.shape) // SIDE_PX))
+    return image[::step, ::step]
+
+
+def _grey(image: npt.NDArray[Any], low: float, high: float) -> npt.NDArray[np.uint8]:
+    """Give a small picture with `low` black and `high` white; NaN is black."""
+    values = np.nan_to_num(_small(image).astype(np.float64), nan=low)
+    return np.asarray(np.clip(255.0 * (values - low) / (high - low), 0, 255), dtype=np.uint8)
+
+
+def _slider(count: int, what: str, handler: str, start: int) -> str:
+    """Write a slider that stands at `start`; one picture needs none."""
+    hidden = " hidden" if count < 2 else ""
+    return (
+        f'<input type="range" min="0" max="{max(count - 1, 0)}" value="{start}" '
+        f'aria-label="{escape(what)}" oninput="{escape(handler)}"{hidden}>'
+    )
+
+
+def _sliding(
+    pictures: Sequence[tuple[str, npt.NDArray[np.uint8]]],
+    what: str,
+    tall: float = 1.0,
+    start: int = 0,
+) -> str:
+    """Write pictures, of which a slider shows one.
+
+    Args:
+        pictures: name and pixels of each.
+        what: they are.
+        tall: height of a pixel over its width.
+        start: index of the one that is shown at first.
+    """
+    drawn = []
+    for k, (name, pixels) in enumerate(pictures):
+        data = base64.b64encode(png_of(pixels)).decode("ascii")
+        rows, cols = pixels.shape
+        scale = SIDE_PX / max(rows * tall, cols)
+        hidden = "" if k == start else " hidden"
+        drawn.append(
+            f'<img data-of="{escape(name)}" alt="{escape(f"{what}, {name}")}" '
+            f'width="{max(1, round(scale * cols))}" height="{max(1, round(scale * tall * rows))}" '
+            f'src="data:image/png;base64,{data}"{hidden}>'
+        )
+    slider = _slider(len(pictures), what, SHOW_CHOSEN, start)
+    return (
+        f'<div style="display:inline-block;margin-right:1em"><b>{escape(what)}</b><br>'
+        f"{''.join(drawn)}<br>{slider}<span>{escape(pictures[start][0])}</span></div>"
+    )
+
+
+def _row(parts: Sequence[str]) -> str:
+    """Write parts beside each other."""
+    return f"<div>{''.join(parts)}</div>"

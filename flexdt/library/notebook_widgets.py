@@ -1,0 +1,62 @@
+"""Show a volume live in a notebook with ipywidgets (the extra `notebook`): any layer and window."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from flexdt.library.datasets.pictures import png_of
+from flexdt.library.notebook_pages import AXES, layer_of, window_of
+
+if TYPE_CHECKING:
+    from flexdt.twin.projection import Volume
+
+WIDTH_PX: Final = 240
+"""Width of a picture."""
+REACH: Final = 0.5
+"""Of the window's width, by which the window's slider goes beyond it on both sides."""
+
+
+def volume_widgets(widgets: Any, volume: Volume, window: Sequence[float] | None = None) -> Any:
+    """Make three linked slices of a volume: a slider for each axis, and one for the window.
+
+    Args:
+        widgets: the package ipywidgets.
+        volume: is seen from above, from the front and from the right.
+        window: attenuation of black and of white at first [1/mm].
+
+    Returns:
+        A box of widgets, which a notebook shows.
+    """
+    low, high = window_of(volume.data, window)
+    beyond = REACH * (high - low)
+    chosen = widgets.FloatRangeSlider(
+        value=(low, high), min=low - beyond, max=high + beyond, step=(high - low) / 200.0,
+        description="1/mm", readout_format=".4f", continuous_update=False,
+    )  # fmt: skip
+    sliders, pictures = {}, {}
+    for name, axis, _ in AXES:
+        count = volume.shape[axis]
+        sliders[name] = widgets.IntSlider(value=count // 2, min=0, max=count - 1, description=name)
+        pictures[name] = widgets.Image(format="png", width=WIDTH_PX)
+
+    def draw(_: object = None) -> None:
+        """Draw all slices, each with lines where the two others lie."""
+        black, white = chosen.value
+        places = {name: slider.value for name, slider in sliders.items()}
+        for name, axis, across in AXES:
+            layer = layer_of(volume.data, axis, places[name])
+            grey = 255.0 * (np.nan_to_num(layer, nan=black) - black) / (white - black)
+            pixels = np.repeat(np.clip(grey, 0, 255).astype(np.uint8)[:, :, None], 3, axis=2)
+            right, up = across[0], across[1]
+            pixels[:, places[right], 0] = 255
+            pixels[len(pixels) - 1 - places[up], :, 0] = 255
+            pictures[name].value = png_of(pixels)
+
+    for control in (chosen, *sliders.values()):
+        control.observe(draw, names="value")
+    draw()
+    columns = [widgets.VBox([pictures[name], sliders[name]]) for name, _, _ in AXES]
+    return widgets.VBox([widgets.HBox(columns), chosen])
