@@ -14,7 +14,7 @@ BACKENDS: Final = {
     "dry-run pages": "flexdt.library.dry_run_page",
     "geometry files": "flexdt.library.geometry_formats",
     "materials": "flexdt.phantoms.materials",
-    "notebook pages": "flexdt.library.notebook_pages",
+    "notebook": "flexdt.library.notebook.notebook_show",
     "plots": "flexdt.library.plots",
     "scripts": "flexdt.library.scripts",
     "volume files": "flexdt.library.reconstruction.volume_files",

@@ -22,7 +22,7 @@ from flexdt.twin.signatures import File, public, with_options_of
 if TYPE_CHECKING:
     from flexdt.library.calibration.align_dataset import Aligned
     from flexdt.library.calibration.calibrate import Outcome
-    from flexdt.library.notebook_pages import NotebookPage
+    from flexdt.library.notebook.notebook_pages import NotebookPage
     from flexdt.phantoms import Phantom
     from flexdt.twin.physics.tube import Tube
     from flexdt.twin.projection import Volume
@@ -249,7 +249,7 @@ class DataSet(ImageSet):
             >>> "sinogram" in data.show().html
             True
         """
-        from flexdt.library.notebook_pages import data_page
+        from flexdt.library.notebook.notebook_pages import data_page
 
         return data_page(self)
 

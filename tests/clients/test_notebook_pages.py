@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import flexdt as fx
-from flexdt.library.notebook_pages import MOST_PICTURES, NotebookPage
+from flexdt.library.notebook.notebook_pages import MOST_PICTURES, NotebookPage
 
 PICTURE = re.compile(
     r'<img data-of="(.*?)" .*?width="(\d+)" height="(\d+)" src="data:.*?,(.*?)"(.*?)>'
@@ -102,7 +102,7 @@ def test_axes_of_a_plotted_geometry_are_equal() -> None:
 
 def test_widgets_show_any_layer_and_window() -> None:
     widgets = pytest.importorskip("ipywidgets", reason="the extra `notebook`")
-    from flexdt.library.notebook_widgets import volume_widgets
+    from flexdt.library.notebook.notebook_widgets import volume_widgets
 
     values = np.random.default_rng(7).normal(size=(6, 4, 5)).astype(np.float32)
     box = volume_widgets(widgets, fx.Volume(values, 0.5))

@@ -576,7 +576,7 @@ class ConeVec:
             >>> "view 3 of 4" in scan.show().html
             True
         """
-        return backend("notebook pages").geometry_page(self)
+        return backend("notebook").show_geometry(self)
 
     def plot(self, axes: Any = None) -> Any:
         """Plot source, detector and rays in three dimensions; needs matplotlib

@@ -327,7 +327,7 @@ class Volume:
             >>> "z = 0.25 mm" in page.html
             True
         """
-        return backend("notebook pages").show_volume(self, window)
+        return backend("notebook").show_volume(self, window)
 
     def to_xarray(self) -> Any:
         """The values as an xarray DataArray (z, y, x) with positions [mm], which needs xarray.

@@ -118,7 +118,8 @@ def read_volume(file: File) -> Volume:
             place = [float(p) + (n - 1) / 2 * edge
                      for p, n, edge in zip(place, sizes, edges, strict=True)]  # fmt: skip
         x, y, z = (float(p) for p in place)
-        return Volume(values, edges, (x, y, z))
+        cubes = along_x == along_y == along_z
+        return Volume(values, along_x if cubes else edges, (x, y, z))
     except (ValueError, KeyError, TypeError, AttributeError, IndexError):
         raise LimitError(
             f"{path}: not a volume of flexdt reconstruct", {"file": str(path)}

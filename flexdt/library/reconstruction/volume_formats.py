@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import math
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -77,6 +78,16 @@ class VoxelPlaces:
             said = f"voxels of {' x '.join(f'{edge:g}' for edge in self.edges_mm)} mm"
             raise GeometryError.instead(said, list(self.edges_mm), "cubes, three equal edges")
         return Grid(self.shape, self.edges_mm[0], self.center_mm)
+
+    @property
+    def voxel_mm(self) -> float:
+        """Give the edge of cubes [mm]; raises as `grid`."""
+        return self.grid.voxel_mm
+
+    @property
+    def bytes(self) -> int:
+        """Give the size of the values as float32."""
+        return 4 * math.prod(self.shape)
 
     @property
     def first_mm(self) -> list[float]:

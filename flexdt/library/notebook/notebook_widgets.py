@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from flexdt.library.datasets.pictures import png_of
-from flexdt.library.notebook_pages import AXES, layer_of, window_of
+from flexdt.library.notebook.notebook_slices import AXES, layer_of, window_of
 
 if TYPE_CHECKING:
     from flexdt.twin.projection import Volume

@@ -17,10 +17,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.library.datasets.pictures import PERCENTILES, png_of
-from flexdt.library.extras import lacking, package
+from flexdt.library.datasets.pictures import png_of
+from flexdt.library.notebook.notebook_slices import AXES, layer_of, window_of
 from flexdt.runtime.files.whole_files import write_whole
-from flexdt.runtime.progress_bars import in_notebook
 from flexdt.twin.errors import TwinError
 
 if TYPE_CHECKING:
@@ -30,8 +29,6 @@ if TYPE_CHECKING:
 
 MOST_PICTURES: Final = 24
 """Pictures behind a slider; of more, so many are taken, evenly spread."""
-MOST_VALUES: Final = 1_000_000
-"""Of which percentiles are taken; of more, about so many are taken, evenly spread."""
 SIDE_PX: Final = 220
 """Longest side of a picture."""
 DRAWING_PX: Final = 420
@@ -42,8 +39,6 @@ ELEVATION_DEG: Final = 30.0
 """Of the eye above the plane of the turn, in the drawing of a geometry."""
 PANEL_CORNERS: Final = ((-0.5, -0.5), (-0.5, 0.5), (0.5, 0.5), (0.5, -0.5))
 """Of a panel, in parts of its rows and columns from its centre."""
-AXES: Final = (("z", 0, "xy"), ("y", 1, "xz"), ("x", 2, "yz"))
-"""Name of an axis, its place in the data, and the axes of its layers (to the right, up)."""
 NOT_DRAWN: Final = ' style="display:none"'
 HIDE_DRAWN: Final = "e.style.display = i == this.value ? '' : 'none'"
 """As `hidden`, which SVG does not know."""
@@ -83,16 +78,6 @@ class NotebookPage:
         write_whole(Path(file), f"{head}\n{self.html}\n")
 
 
-def show_volume(volume: Volume, window: Sequence[float] | None = None) -> Any:
-    """See `Volume.show`."""
-    if in_notebook() and lacking("ipywidgets", "ipywidgets", "notebook") is None:
-        from flexdt.library.notebook_widgets import volume_widgets
-
-        widgets = package("ipywidgets", "a volume with live sliders", "notebook")
-        return volume_widgets(widgets, volume, window)
-    return volume_page(volume, window)
-
-
 def volume_page(volume: Volume, window: Sequence[float] | None = None) -> NotebookPage:
     """Show the layers of a volume along its three axes, a slider for each.
 
@@ -121,18 +106,6 @@ def volume_page(volume: Volume, window: Sequence[float] | None = None) -> Notebo
         _row(parts) + f"<div>{escape(caption)}; black {low:.4g}, white {high:.4g} 1/mm</div>",
         caption,
     )
-
-
-def layer_of(data: npt.NDArray[Any], axis: int, index: int) -> npt.NDArray[Any]:
-    """Give one layer of a volume (nz, ny, nx), the last axis to the right and the other up.
-
-    Args:
-        data: the volume's values.
-        axis: 0 for z, 1 for y, 2 for x.
-        index: of the layer along it.
-    """
-    layer: npt.NDArray[Any] = np.take(data, index, axis)[::-1]
-    return layer
 
 
 def data_page(data: ImageSet) -> NotebookPage:
@@ -276,27 +249,6 @@ def panel_corners(cone_vec: ConeVec, index: int) -> npt.NDArray[np.float64]:
     rows, cols = cone_vec.detector_shape or (0, 0)
     centre, u, v = cone_vec.detector[index], cone_vec.u[index], cone_vec.v[index]
     return np.array([centre + r * rows * v + c * cols * u for r, c in PANEL_CORNERS])
-
-
-def window_of(values: npt.NDArray[Any], window: Sequence[float] | None) -> tuple[float, float]:
-    """Give the values of black and white.
-
-    Args:
-        values: whose percentiles are taken where no window is given; NaN is left out.
-        window: (black, white).
-
-    Raises:
-        TwinError: not two numbers, the first the smaller one.
-    """
-    if window is None:
-        step = max(1, round((values.size / MOST_VALUES) ** (1.0 / values.ndim)))
-        seen = values[(slice(None, None, step),) * values.ndim]
-        seen = seen[np.isfinite(seen)]
-        low, high = np.percentile(seen, PERCENTILES).tolist() if seen.size else (0.0, 1.0)
-        return low, high if high > low else low + 1.0
-    if len(window) != 2 or not window[0] < window[1]:
-        raise TwinError.instead(f"window {window!r}", list(window), "(black, white), black first")
-    return float(window[0]), float(window[1])
 
 
 def _some(count: int) -> list[int]:

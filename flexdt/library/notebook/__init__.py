@@ -1,0 +1,1 @@
+"""What values show in a notebook."""

@@ -1,0 +1,50 @@
+"""Choose the slices of a volume that a notebook shows, and their window."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.library.datasets.pictures import PERCENTILES
+from flexdt.twin.errors import TwinError
+
+MOST_VALUES: Final = 1_000_000
+"""Of which percentiles are taken; of more, about so many are taken, evenly spread."""
+AXES: Final = (("z", 0, "xy"), ("y", 1, "xz"), ("x", 2, "yz"))
+"""Name of an axis, its place in the data, and the axes of its layers (to the right, up)."""
+
+
+def layer_of(data: npt.NDArray[Any], axis: int, index: int) -> npt.NDArray[Any]:
+    """Give one layer of a volume (nz, ny, nx), the last axis to the right and the other up.
+
+    Args:
+        data: the volume's values.
+        axis: 0 for z, 1 for y, 2 for x.
+        index: of the layer along it.
+    """
+    layer: npt.NDArray[Any] = np.take(data, index, axis)[::-1]
+    return layer
+
+
+def window_of(values: npt.NDArray[Any], window: Sequence[float] | None) -> tuple[float, float]:
+    """Give the values of black and white.
+
+    Args:
+        values: whose percentiles are taken where no window is given; NaN is left out.
+        window: (black, white).
+
+    Raises:
+        TwinError: not two numbers, the first the smaller one.
+    """
+    if window is None:
+        step = max(1, round((values.size / MOST_VALUES) ** (1.0 / values.ndim)))
+        seen = values[(slice(None, None, step),) * values.ndim]
+        seen = seen[np.isfinite(seen)]
+        low, high = np.percentile(seen, PERCENTILES).tolist() if seen.size else (0.0, 1.0)
+        return low, high if high > low else low + 1.0
+    if len(window) != 2 or not window[0] < window[1]:
+        raise TwinError.instead(f"window {window!r}", list(window), "(black, white), black first")
+    return float(window[0]), float(window[1])
