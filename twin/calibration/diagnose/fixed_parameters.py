@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from scipy.special import chdtri, fdtrc, stdtr
+from scipy.special import chdtri, fdtrc
 
 from flexdt.twin.calibration.diagnose import Finding, error, warning
 from flexdt.twin.calibration.fit.certificate import widened
@@ -271,13 +271,16 @@ def _deviate(chance: float) -> float:
 
 
 def _deviate_of(ratio: float, freedom: float) -> float:
-    """Give the normal deviate that is as improbable as a deviation in sigmas.
+    """Give the normal deviate that is about as improbable as a deviation in sigmas.
+
+    Source: Wallace, Annals of Mathematical Statistics 30 (1959) 1121; it has no largest value.
 
     Args:
         ratio: the deviation over its sigma.
         freedom: degrees of freedom with which sigma is known (Student).
     """
-    return _deviate(2.0 * float(stdtr(freedom, -abs(ratio))))
+    share = (8.0 * freedom + 1.0) / (8.0 * freedom + 3.0)
+    return share * math.sqrt(freedom * math.log1p(ratio**2 / freedom))
 
 
 def _chance(square: float, count: int, freedom: float) -> float:
