@@ -67,9 +67,20 @@ class Scored:
         return self.offered and self.worst > WRONG_SIGMAS and not self.conditional
 
 
-def calibrated(scan: Faulty, per_frame: tuple[str, ...] = ()) -> Calibration:
-    """The calibration of a drawn scan from its spots, told only what the operator believes; and
-    what may differ from frame to frame."""
+def calibrated(
+    scan: Faulty,
+    per_frame: tuple[str, ...] = (),
+    free: tuple[str, ...] = (),
+    bead_tolerance_mm: float | None = None,
+) -> Calibration:
+    """Calibrate a drawn scan from its spots, told only what the operator believes.
+
+    Args:
+        scan: the scan.
+        per_frame: what may differ from frame to frame.
+        free: what is free beside what the operator frees.
+        bead_tolerance_mm: standard deviation of the beads' places.
+    """
     looks = []
     for frame in scan.spots:
         if frame is None:
@@ -81,10 +92,12 @@ def calibrated(scan: Faulty, per_frame: tuple[str, ...] = ()) -> Calibration:
     b = scan.believed
     poses = Poses.upright([0, 0, 0], [0, b.sod, 0], [0, b.sdd, 0], b.pixel, np.radians(b.angles))
     request = CalibrationRequest(
-        free=b.free, start=Offsets.from_edge(b.held), priors=b.priors, second_look=False,
-        per_frame=per_frame,
+        free=tuple(dict.fromkeys((*b.free, *free))), start=Offsets.from_edge(b.held),
+        priors=b.priors, second_look=False, per_frame=per_frame,
+        bead_tolerance_mm=bead_tolerance_mm,
     )  # fmt: skip
-    return calibrate([Scan(SpotFrames(looks), poses)], BeadModel(b.beads, b.radii), request)
+    taken = Scan(SpotFrames(looks), poses, arc=b.arc)
+    return calibrate([taken], BeadModel(b.beads, b.radii), request)
 
 
 def scored(kind: str, seed: int) -> Scored:

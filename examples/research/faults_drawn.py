@@ -57,7 +57,8 @@ class World:
 
 @dataclass(frozen=True, eq=False)
 class Believed:
-    """What calibration is told."""
+    """What calibration is told; `arc` is the part of a step that an exposure lasts, if anybody
+    says it."""
 
     beads: Array
     radii: Array
@@ -68,6 +69,7 @@ class Believed:
     free: tuple[str, ...] = SIX
     held: Mapping[str, float] = field(default_factory=dict)
     priors: Mapping[str, float] = field(default_factory=dict)
+    arc: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -670,6 +672,13 @@ def _exposed_long(draft: Draft, rng: Rng) -> Draft:
                    beside=(*draft.beside, "causes_open", "phantom_strained"))  # fmt: skip
 
 
+def _exposed_as_said(draft: Draft, rng: Rng) -> Draft:
+    """A continuous scan whose script says how long each exposure lasts."""
+    draft = _exposed_long(draft, rng)
+    share = draft.world.arc * len(draft.world.angles) / 360.0
+    return replace(draft, believed=replace(draft.believed, arc=share))
+
+
 def _renumbered(shift: int) -> Fault:
     """From a frame on, images are those of `shift` frames later: -1 where one was doubled, 1 where
     one was lost."""
@@ -833,6 +842,7 @@ KINDS: Final[Mapping[str, Fault]] = {
     "strain_shear": _strained("shear"),
     "strain_lean": _strained("lean"),
     "exposed_long": _exposed_long,
+    "exposed_as_said": _exposed_as_said,
     "frame_doubled": _renumbered(-1),
     "frame_lost": _renumbered(1),
     "exposed_again": _exposed_again,

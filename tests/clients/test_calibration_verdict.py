@@ -66,6 +66,21 @@ def test_proposed_commands_exist(code: str) -> None:
         known(line.format(data="scan", phantom="lego", free="dO_x"))
 
 
+def test_one_marker_alone_is_a_problem_that_is_named() -> None:
+    phantom = fx.phantoms.bead_phantom("normal", 1)
+    seen = SCAN.project_points(phantom.beads)
+    marks = [(frame, 0, *seen[frame, 0].tolist(), None) for frame in range(len(seen))]
+    document: Any = fx.calibrate(None, phantom, geometry=SCAN, markers=marks).document
+    assert not document["identifiable"]
+    (problem,) = document["problems"]
+    assert problem["code"] == "undetermined"
+    assert problem["severity"] == "error"
+    assert document["weak"][0] in problem["text"]
+    assert problem["text"] in document["verdict"]
+    for line in document["next"]:
+        known(line)
+
+
 def test_marks_that_were_left_out_are_named() -> None:
     """Two marks are moved by some pixels; the others have noise of a tenth."""
     rng = np.random.default_rng(3)

@@ -60,6 +60,7 @@ def explain(
         strain_prior(state.model, request),
         request.bead_tolerance_mm,
         (MEASURED if weighed else Solver()).floor_px,
+        _stated_arc(state),
     )
     return explain_residuals(
         fit,
@@ -68,6 +69,13 @@ def explain(
         sigmas_known=bool(state.measured),
         misfit_px=request.misfit_px,
     )
+
+
+def _stated_arc(state: Calibration) -> float | None:
+    """Give the part of a step that an exposure lasts in all scans; None: they differ, or nobody
+    says it."""
+    arcs = {scan.arc for scan in state.scans}
+    return arcs.pop() if len(arcs) == 1 else None
 
 
 def check_fixed(

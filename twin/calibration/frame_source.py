@@ -158,6 +158,8 @@ class Scan:
 
     `priors` are the standard deviations of the scanner's offsets [mm, deg, 1], see `fit.priors`.
     `index` (n, beads) says which spot of each frame is which bead (-1: none), where that is known.
+    `arc` is the part of a step that the object turns while a frame is exposed, 0 where it stands
+    still; None: nobody says it.
     """
 
     frames: Frames
@@ -165,3 +167,4 @@ class Scan:
     name: str = "scan"
     priors: Mapping[str, float] = field(default_factory=lambda: ASSUMED)
     index: npt.NDArray[np.int64] | None = None
+    arc: float | None = None

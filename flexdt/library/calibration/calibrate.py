@@ -25,6 +25,7 @@ import numpy as np
 from flexdt.library.calibration.calibration_options import CalibrationOptions
 from flexdt.library.calibration.calibration_request import detection_of, request_of
 from flexdt.library.calibration.dataset_frames import DatasetFrames
+from flexdt.library.calibration.exposure_share import exposure_share
 from flexdt.library.calibration.markers import (
     Mark,
     Scale,
@@ -40,7 +41,7 @@ from flexdt.phantoms import Phantom, load_phantom
 from flexdt.phantoms.files.phantom_files import read_phantom_file
 from flexdt.twin import long_work
 from flexdt.twin.calibration.detect.detection import SpotFinder
-from flexdt.twin.calibration.diagnose import Finding, Severity
+from flexdt.twin.calibration.diagnose import Finding, Severity, error
 from flexdt.twin.calibration.fit.certificate import Estimate
 from flexdt.twin.calibration.fit.fit import FitResult, image_quantities
 from flexdt.twin.calibration.fit.priors import prior_widths
@@ -217,12 +218,13 @@ def calibrate_datasets(
             result = calibrate_known(datasets[0], marked, target, want)
         else:
             scans = [
-                Scan(f, d.poses, d.name, prior_widths(d.machine, d.profile))
+                Scan(f, d.poses, d.name, prior_widths(d.machine, d.profile), arc=exposure_share(d))
                 for f, d in zip(frames, datasets, strict=True)
             ]
             with long_work.during("calibrating") as passes.advance, saturation_named(saturated):
                 result = calibrate(scans, target, want, detector=sought)
     result = replace(result, findings=explained_by(saturated, result.findings))
+    result = with_undetermined(result)
     seconds = time.perf_counter() - start
     document = calibration_document(result, seconds) | told
     given = phantom if isinstance(phantom, str) else target.name
@@ -258,6 +260,14 @@ def explained_by(saturated: Sequence[Finding], findings: Sequence[Finding]) -> t
         return tuple(findings)
     others = (finding for finding in findings if finding.code not in OF_SATURATION)
     return (*saturated, *others)
+
+
+def with_undetermined(result: Calibration) -> Calibration:
+    """Add the finding of a calibration that nothing forbids and the images do not determine."""
+    if result.identifiable or result.errors:
+        return result
+    weak = () if result.fit is None else result.fit.certificate.weak
+    return result.with_findings(error(UNDETERMINED, "; ".join(weak) or "there is no fit"))
 
 
 def saturation(dataset: ImageSet) -> Finding | None:
@@ -301,6 +311,8 @@ def find_phantom(phantom: str | Phantom) -> Phantom:
     return found
 
 
+UNDETERMINED: Final = "undetermined"
+"""Code of the finding that the images do not determine what was asked for."""
 OF_SATURATION: Final = ("bead_size",)
 """Codes of findings that saturated images cause."""
 NUMBERS: Final = ("value", "sigma", "low", "high", "images")
@@ -335,7 +347,7 @@ def calibration_document(result: Calibration, seconds: float) -> dict[str, objec
         return document
     certificate = fit.certificate
     off = np.hypot(*np.moveaxis(certificate.residuals_px, 2, 0))
-    offered = not result.errors
+    offered = all(finding.code == UNDETERMINED for finding in result.errors)
     parameters = {}
     for name, e in certificate.estimates.items():
         known = offered and math.isfinite(e.sigma)
@@ -467,7 +479,7 @@ def next_commands(result: Calibration, data: Sequence[str], phantom: str) -> lis
     names = " ".join(shlex.quote(one) for one in data)
     estimates = {} if result.fit is None else result.fit.certificate.estimates
     asked = [e for e in estimates.values() if e.asked]
-    if result.errors:
+    if result.errors and result.errors[0].code != UNDETERMINED:
         free = ",".join(name for name, e in estimates.items() if e.asked)
         lines = NEXT.get(result.errors[0].code, (_COMPARE,))
         return [line.format(data=names, phantom=shlex.quote(phantom), free=free) for line in lines]

@@ -21,6 +21,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.library.calibration.exposure_share import exposure_share
 from flexdt.library.datasets.image_set import Images, ImageSet
 from flexdt.phantoms import Phantom
 from flexdt.runtime.files.dataset_folder import read_text
@@ -391,7 +392,9 @@ def _calibrated(
     images: Frames | None = None,
 ) -> Calibration:
     priors = prior_widths(data.machine, data.profile)
-    scan = Scan(SpotFrames(looks, images), data.poses, data.name, priors, index)
+    scan = Scan(
+        SpotFrames(looks, images), data.poses, data.name, priors, index, exposure_share(data)
+    )
     if images is None:
         sigma = np.concatenate([look.detections.covariances[:, 0, 0] for look in looks]) ** 0.5
         most = max(request.misfit_px, 3.0 * float(np.median(sigma)))

@@ -41,6 +41,11 @@ OPEN: Final = math.log(100.0)
 """Logarithm of the odds against a cause up to which it is left open."""
 CHANCE: Final = math.log(0.1)
 """Logarithm of the probability that a scan has a cause, before it is seen; assumed."""
+TOLD_CHANCE: Final = math.log(0.5)
+"""The same of a cause that the script says: images may be made of instants; assumed."""
+ARC_TOLERANCE: Final = 0.2
+"""Standard deviation of the squared share of a step that the script says, as a part of it: where
+in the exposure the trigger lies is not published; assumed."""
 OUTLIER: Final = 5.0
 """Residuals beyond so many robust standard deviations count as so many."""
 STRAIN_WIDTHS: Final = (1e-3, 2.5e-3, 6e-3, 1.5e-2, 4e-2)
@@ -124,11 +129,14 @@ class Known:
         strain: priors of the phantom's stretches and shears, 0: it has its stated shape.
         bead_tolerance_mm: of the request; None: unknown, 0: beads are where the phantom says.
         floor: least standard deviation of whitened residuals.
+        arc: part of a step that the object turns in an exposure, as the script says, 0: it stands
+            still; None: nobody says it.
     """
 
     strain: Strain
     bead_tolerance_mm: float | None
     floor: float
+    arc: float | None = None
 
 
 Refit = Callable[..., FitResult]
@@ -160,6 +168,7 @@ class Candidates:
         self._judged: dict[Choice, Judged | None] = {}
         self.means = np.zeros(table.shape[1])
         self.means[: self.count] = (problem.prior_mean - x)[: self.count]
+        self.means[everything.layout.arc_column] = (known.arc or 0.0) ** 2
 
     def _moving(self) -> list[str]:
         sizes = np.bincount(self.fit.problem.group)
@@ -196,7 +205,7 @@ class Candidates:
                 widths = tuple(w for s in BEAD_SHARES if (w := s * size) > 1.5 * said)
                 columns = tuple(range(layout.bead_columns.start, layout.bead_columns.stop))
                 out.append(Cause("beads", columns, widths, always=said))
-        out.append(Cause("arc", (layout.arc_column,), (ARC_PRIOR,)))
+        out += _arc(layout.arc_column, known.arc)
         panel = everything.panel
         if panel is not None:
             first = layout.panel_column
@@ -335,6 +344,20 @@ class Candidates:
             self.rows[:, model.columns], self.values, widths, model.noise,
             predicted, problem.whiten[problem.seen], shape, self.borders,
         )  # fmt: skip
+
+
+def _arc(column: int, share: float | None) -> list[Cause]:
+    """Give the cause that the object turns while a frame is exposed; none where it stands still.
+
+    Args:
+        column: of the squared share of a step.
+        share: of a step, as the script says; None: nobody says it.
+    """
+    if share is None:
+        return [Cause("arc", (column,), (ARC_PRIOR,))]
+    if share == 0.0:
+        return []
+    return [Cause("arc", (column,), (ARC_TOLERANCE * share**2,), TOLD_CHANCE)]
 
 
 def explained_by_causes(fit: FitResult, known: Known, refit: Refit) -> tuple[FitResult, Found]:
