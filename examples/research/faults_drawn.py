@@ -233,10 +233,13 @@ def drawn(kind: str, seed: int) -> Faulty:
         spots.append(rng.permutation(rows[inside]))
     if draft.after is not None:
         spots = draft.after(spots)
+    scale = float(np.polyfit(draft.believed.angles, draft.world.angles, 1)[0])
     truth = {
         name: (float(np.min(value)), float(np.max(value)))
-        for name, value in {**draft.world.offsets, **draft.truth}.items()
-    }
+        for name, value in {
+            "angle_scale": scale, **draft.world.offsets, **draft.truth,
+        }.items()
+    }  # fmt: skip
     return Faulty(
         spots,
         draft.believed,
