@@ -111,6 +111,7 @@ def as_on_a_device(block: tuple[int, int] = (32, 4)) -> None:
     kernelapi.FakeCUDALocal.array = local
     kernelapi.FakeCUDAShared.array = shared
     gpu_kernels.exchange = exchange
+    gpu_kernels.LANES_MEET = True
     gpu_kernels.BLOCK = block
 
 

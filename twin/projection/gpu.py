@@ -45,6 +45,8 @@ SIDE = 2**14
 leaves within the margin of the slab walk."""
 NEAR = 1e-9
 """A box this near to the source or the detector's plane, of their distance, is not clear of it."""
+KINDS = 3
+"""Kinds of walks: ray by ray, by slabs, by slabs in upright columns."""
 LINEAR = 256
 """Threads a block where each has one number."""
 LOGGER = logging.getLogger("flexdt")
@@ -347,28 +349,54 @@ def by_slabs(box: Box, views: FloatArray, shape: tuple[int, int]) -> npt.NDArray
     Convex conditions, held by a detector's corners and so by all its pixels; a view that fails may
     still have only such rays.
     """
-    rows, cols = shape
-    counts = (box.nx, box.ny, box.nz)
-    if max(counts) >= SIDE or (box.flat is not None and box.flat.size >= 2**31):
-        return np.zeros(len(views), np.bool_)
-    source, first, u, v = (views[:, i : i + 3] for i in (0, 3, 6, 9))
-    ends = np.array([[c, r] for c in (0, cols - 1) for r in (0, rows - 1)])
-    corners = first[:, None] + ends[:, :1] * u[:, None] + ends[:, 1:] * v[:, None]
+    return clear_of(box, views, shape) & (rises(views, shape) <= 1.0)
+
+
+def rises(views: FloatArray, shape: tuple[int, int]) -> FloatArray:
+    """Compute a bound of the voxels that rays rise for each along the faster one of x and y, (n,).
+
+    Infinity where rays of a view may go along different ways of these axes.
+    """
+    corners = _corners(views, shape)
     middle = corners[:, :, :2].mean(axis=1)
     diagonal = middle / (math.sqrt(2.0) * np.linalg.norm(middle, axis=1, keepdims=True))
     axes = np.broadcast_to([[1.0, 0], [-1, 0], [0, 1], [0, -1]], (len(views), 4, 2))
     ways = np.concatenate([axes, diagonal[:, None]], axis=1)
-    ahead = np.einsum("nwi,nki->nwk", ways, corners[:, :, :2])
-    rise = np.abs(corners[:, None, :, 2])
-    slow = np.any(((ahead > 0.0) & (ahead >= rise)).all(axis=2), axis=1)
+    ahead = np.matmul(ways, corners[:, :, :2].transpose(0, 2, 1))
+    rise = np.broadcast_to(np.abs(corners[:, None, :, 2]), ahead.shape)
+    bounds = np.divide(rise, ahead, out=np.full(ahead.shape, np.inf), where=ahead > 0.0)
+    return np.asarray(bounds.max(axis=2).min(axis=1))
+
+
+def clear_of(box: Box, views: FloatArray, shape: tuple[int, int]) -> npt.NDArray[np.bool_]:
+    """Views whose source lies before a box and whose detector's plane lies behind it, of boxes that
+    the slab walk can place rays in."""
+    counts = (box.nx, box.ny, box.nz)
+    if max(counts) >= SIDE or (box.flat is not None and box.flat.size >= 2**31):
+        return np.zeros(len(views), np.bool_)
+    source, first, u, v = (views[:, i : i + 3] for i in (0, 3, 6, 9))
     # Where the box's corners are on the way from the source (0) to the detector's plane (1).
-    normal = np.cross(u, v)
-    box_ends = np.array([[x, y, z] for x in (0, box.nx) for y in (0, box.ny) for z in (0, box.nz)])
-    along = ((box_ends - source[:, None]) * normal[:, None]).sum(axis=2)
-    depth = (first * normal).sum(axis=1, keepdims=True)
-    along, depth, spare = along * np.sign(depth), abs(depth), NEAR * abs(depth)
-    clear = (along > spare) & (along < depth - spare)
-    return np.asarray(slow & clear.all(axis=1))
+    normal = np.stack(
+        [u[:, i - 2] * v[:, i - 1] - u[:, i - 1] * v[:, i - 2] for i in range(3)], axis=1
+    )
+    # The least and the largest of all corners, axis by axis.
+    spans = normal * np.array(counts)
+    behind = -(source * normal).sum(axis=1)
+    nearest = behind + np.minimum(spans, 0.0).sum(axis=1)
+    farthest = behind + np.maximum(spans, 0.0).sum(axis=1)
+    depth = (first * normal).sum(axis=1)
+    turned = depth < 0.0
+    low, high = np.where(turned, -farthest, nearest), np.where(turned, -nearest, farthest)
+    depth = np.abs(depth)
+    return np.asarray((low > NEAR * depth) & (high < (1.0 - NEAR) * depth))
+
+
+def _corners(views: FloatArray, shape: tuple[int, int]) -> FloatArray:
+    """Corner pixels of the detector minus the source, (n, 4, 3)."""
+    rows, cols = shape
+    first, u, v = (views[:, None, i : i + 3] for i in (3, 6, 9))
+    ends = np.array([[c, r] for c in (0.0, cols - 1.0) for r in (0.0, rows - 1.0)])
+    return np.asarray(first + ends[:, :1] * u + ends[:, 1:] * v)
 
 
 def _launch(*arguments: Any, **options: Any) -> None:
@@ -398,19 +426,26 @@ def launcher(
     rows, cols = shape
     turned = lying(views, (rows, cols))
     rays = np.where(turned[:, None], exchanged(views), views)
-    kind = 2 * turned + by_slabs(box, views, (rows, cols))
+    rise = rises(views, (rows, cols))
+    slabs = clear_of(box, views, (rows, cols)) & (rise <= 1.0)
+    upright = kernels.LANES_MEET & (rays[:, 9:11] == 0.0).all(axis=1) & (rise <= kernels.RISE)
+    kind = KINDS * turned + slabs + (slabs & upright)
     order = np.argsort(kind, kind="stable")
     table = cuda.to_device(np.column_stack([rays, np.arange(len(views))])[order])
-    slabs = kernels.spread_slabs if transposed else kernels.project_slabs
-    single = kernels.spread_rays if transposed else kernels.project_rays
+    walks = (
+        (kernels.spread_rays, kernels.spread_slabs, kernels.spread_columns)
+        if transposed
+        else (kernels.project_rays, kernels.project_slabs, kernels.project_columns)
+    )
     kinds, counts = np.unique(kind, return_counts=True)
 
     def launch() -> None:
         first = 0
         for which, count in zip(kinds, counts, strict=True):
-            lanes, columns, *steps = (cols, rows, 1, cols) if which >= 2 else (rows, cols, cols, 1)
+            lying_down, walk = divmod(int(which), KINDS)
+            lanes, columns, *steps = (cols, rows, 1, cols) if lying_down else (rows, cols, cols, 1)
             grid = (int(count) * -(-columns // kernels.BLOCK[1]), -(-lanes // kernels.BLOCK[0]))
-            (slabs if which % 2 else single)[grid, kernels.BLOCK](
+            walks[walk][grid, kernels.BLOCK](
                 voxels, *box[2:], table, first, int(count), images, lanes, columns, *steps, factor
             )
             first += int(count)
