@@ -202,7 +202,8 @@ def scanned(views: int, what: str, sizes: Sizes) -> np.ndarray[Any, Any]:
 
     radius_mm, sigma = FDK_OBJECTS[what]
     image = image_of(radius_mm, sizes.panel, sizes.pixel_mm)
-    images = np.array(np.broadcast_to(image, (views, *sizes.panel)))
+    images = np.empty((views, *sizes.panel), np.float32)
+    images[:] = image  # in C order: a copy of a broadcast array keeps that of its strides
     if sigma:
         random = np.random.default_rng(0)
         for one in images:

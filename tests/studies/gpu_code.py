@@ -28,10 +28,13 @@ REGISTERS = 64
 """Most registers a thread: 32 warps of 64 have room on one multiprocessor."""
 LOADS = 12
 """Least loads in the forward kernel's unrolled body."""
-A_SLAB = 40
+A_SLAB = {"project_slabs": 40, "project_columns": 28}
 """Most instructions for a slab in that body."""
 UNROLLED = 4
 LOAD, BRANCH = 0x181, 0x147
+LOCAL = {0x183: "LDL", 0x187: "STL"}
+PUT_ASIDE = {"project_columns": 64}
+"""Most bytes of local memory of kernels that put numbers aside outside of their inner loops."""
 DOUBLE = {0x028: "DMUL", 0x029: "DADD", 0x02A: "DSETP", 0x02B: "DFMA"}
 PACKAGE = Path(__file__).parents[2] / "twin"
 
@@ -43,6 +46,11 @@ class Code:
     registers: int
     local_bytes: int
     loops: list[list[int]]
+
+    @property
+    def local_in_loops(self) -> int:
+        """Loads and stores of local memory in inner loops."""
+        return sum(op in LOCAL for loop in self.loops for op in loop)
 
     @property
     def busiest(self) -> list[int]:
@@ -70,14 +78,16 @@ def compiled(kernel: Any, signature: tuple[Any, ...], ptxas: Path) -> Code:
     with tempfile.TemporaryDirectory() as folder:
         source, binary = Path(folder) / "kernel.ptx", Path(folder) / "kernel.cubin"
         source.write_text(ptx)
+        limit = getattr(kernel, "targetoptions", {}).get("max_registers")
+        limits = [f"-maxrregcount={limit}"] if limit else []
         done = subprocess.run(
-            [ptxas, "-v", "-arch=sm_90", source, "-o", binary],
+            [ptxas, "-v", "-arch=sm_90", *limits, source, "-o", binary],
             capture_output=True, text=True, check=True,
         )  # fmt: skip
         words = text_section(binary.read_bytes())
     (registers,) = re.findall(r"Used (\d+) registers", done.stderr)
-    frames = re.findall(r"(\d+) bytes (?:stack frame|spill stores|spill loads)", done.stderr)
-    return Code(int(registers), sum(map(int, frames)), innermost_loops(words))
+    (frame,) = re.findall(r"(\d+) bytes stack frame", done.stderr)
+    return Code(int(registers), int(frame), innermost_loops(words))
 
 
 def text_section(elf: bytes) -> list[tuple[int, int]]:
@@ -113,7 +123,7 @@ def innermost_loops(words: list[tuple[int, int]]) -> list[list[int]]:
 
 def all_kernels() -> dict[str, tuple[Any, tuple[Any, ...]]]:
     """Every kernel with the types of its arguments."""
-    from numba import boolean, float32, float64, int64, types
+    from numba import boolean, float32, float64, int32, int64, types
 
     project = load_kernels("projection/kernels/gpu_kernels.py")
     fdk = load_kernels("reconstruction/kernels/gpu_reconstruction_kernels.py")
@@ -126,16 +136,21 @@ def all_kernels() -> dict[str, tuple[Any, tuple[Any, ...]]]:
             *[int64] * 4, float64,
         )  # fmt: skip
 
+    sizes, tables, shares = (int64, int64, int64), (flat2, flat2, flat2, images), (flat,) * 6
+    rows_of_two = (images, *sizes, *tables, int32[::1], *shares, int64, images)
     return {
         "project_slabs": (project.project_slabs, walk(float32)),
         "spread_slabs": (project.spread_slabs, walk(float32)),
         "spread_slabs, deterministic": (project.spread_slabs, walk(int64)),
+        "project_columns": (project.project_columns, walk(float32)),
+        "spread_columns": (project.spread_columns, walk(float32)),
         "project_rays": (project.project_rays, walk(float32)),
         "spread_rays": (project.spread_rays, walk(float32)),
         "spread_rays, deterministic": (project.spread_rays, walk(int64)),
         "clear": (project.clear, (float32[::1],)),
         "unscale": (project.unscale, (int64[::1], float64, float32[::1])),
         "weigh": (fdk.weigh, (images, int64, flat2, flat2, flat2, images)),
+        "filter_rows": (fdk.filter_rows, rows_of_two),
         "convolve": (fdk.convolve, (images, float32[::1], int64, images)),
         "backproject": (
             fdk.backproject,
@@ -161,15 +176,15 @@ def faults(name: str, code: Code) -> list[str]:
     found = []
     if code.registers > REGISTERS:
         found.append(f"{code.registers} registers, allowed {REGISTERS}")
-    if code.local_bytes:
-        found.append(f"{code.local_bytes} bytes of local memory")
+    if code.local_bytes > PUT_ASIDE.get(name, 0) or code.local_in_loops:
+        found.append(f"{code.local_bytes} bytes of local memory, {code.local_in_loops} in loops")
     if any(set(some) & set(DOUBLE) for some in code.loops):
         found.append("double precision in an inner loop")
-    if name == "project_slabs":
+    if name in A_SLAB:
         if loop.count(LOAD) < LOADS:
             found.append(f"{loop.count(LOAD)} loads in the unrolled body, wanted {LOADS}")
-        if len(loop) > A_SLAB * UNROLLED:
-            found.append(f"{len(loop) / UNROLLED} instructions a slab, allowed {A_SLAB}")
+        if len(loop) > A_SLAB[name] * UNROLLED:
+            found.append(f"{len(loop) / UNROLLED} instructions a slab, allowed {A_SLAB[name]}")
     return found
 
 

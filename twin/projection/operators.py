@@ -71,6 +71,8 @@ fitted to drawn geometries, each timed all four ways (`tests/studies/walks.py`),
 only their ratios count."""
 PREFERRED = 0.75
 """Another axis takes less than this share of the time, or is not worth another layout."""
+ON_ALL_CORES = 16 * 2**20
+"""Bytes of projections from which all cores look at them together."""
 Shape2 = tuple[int, int]
 
 
@@ -376,7 +378,7 @@ def require_line_integrals(projections: Any) -> None:
 
 def require_finite(values: Any) -> None:
     """Raise GeometryError for projections in memory that are not finite."""
-    if not gpu.is_there(values) and not math.isfinite(float(values.sum())):
+    if not gpu.is_there(values) and not _are_finite(values):
         said = "projections hold values that are not finite"
         raise GeometryError.instead(said, "NaN or infinity", "finite line integrals")
 
@@ -389,6 +391,15 @@ def voxel_rays(cone_vec: ConeVec, layout: Layout, shape: Shape2) -> FloatArray:
     rays = cone_vec.rays(shape)
     rays[:, 0:3] -= np.array(layout.low_mm)
     return np.ascontiguousarray(rays / np.tile(np.array(layout.voxel_mm), 4))
+
+
+def _are_finite(values: npt.NDArray[Any]) -> bool:
+    """Whether all numbers are finite, looked at by all cores where they are many."""
+    if values.nbytes < ON_ALL_CORES or values.dtype != np.float32 or not values.flags.c_contiguous:
+        return math.isfinite(float(values.sum()))
+    from flexdt.twin.projection.kernels import layout_kernels
+
+    return int(layout_kernels.unfit_parts(values.reshape(-1).view(np.uint32))) == 0
 
 
 def as_cone_vec(cone_vec: ConeVec | npt.ArrayLike) -> ConeVec:

@@ -290,6 +290,7 @@ from flexdt.twin.projection.kernels import gpu_kernels
 from flexdt.twin.reconstruction.kernels import gpu_reconstruction_kernels as gpu_fdk_kernels
 
 gpu_kernels.BLOCK = gpu_fdk_kernels.BLOCK = gpu_fdk_kernels.PLANE = (4, 2)
+gpu_fdk_kernels.THREADS = 8
 gpu_kernels.FOLDING = (1, 4)
 gpu.LINEAR, gpu.VIEWS_A_THREAD, device_page.ROUNDS = 64, 0.0, 1
 device_page.BESIDE_S = 0.0

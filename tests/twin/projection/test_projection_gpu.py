@@ -357,6 +357,7 @@ class Keep(logging.Handler):
 logging.getLogger("flexdt").addHandler(Keep())
 gpu.VIEWS_A_THREAD = 0.0
 gpu_kernels.BLOCK = gpu_reconstruction_kernels.BLOCK = (4, 2)
+gpu_reconstruction_kernels.THREADS = 8
 
 def again(present):
     said.clear(); gpu._failed.clear(); gpu._probed.cache_clear()
@@ -471,6 +472,7 @@ class Keep(logging.Handler):
 logging.getLogger("flexdt").addHandler(Keep())
 gpu.VIEWS_A_THREAD, gpu.LINEAR = 0.0, 16
 gpu_kernels.BLOCK = gpu_reconstruction_kernels.BLOCK = gpu_reconstruction_kernels.PLANE = (4, 2)
+gpu_reconstruction_kernels.THREADS = 8
 gpu_kernels.FOLDING = (1, 4)
 scan, shape = _circle(3, 60.0, 100.0, 1.2, start=0.3), (3, 4)
 data = np.random.default_rng(0).random((2, 3, 4), dtype=np.float32)

@@ -20,8 +20,10 @@ from flexdt.twin.reconstruction import Grid, fdk
 from flexdt.twin.reconstruction.feldkamp.backprojection import device_takes
 from flexdt.twin.reconstruction.feldkamp.fdk import fdk_parts
 from flexdt.twin.reconstruction.acquisition.truncation import Prism, Truncation
+from flexdt.twin.reconstruction.kernels import gpu_reconstruction_kernels
 from tests.twin.reconstruction.scans import ball, circle
 
+gpu_reconstruction_kernels.THREADS = 8
 assert gpu.availability().present
 WIDER = Truncation(np.zeros(1), (Prism(np.zeros(2), np.eye(2) / 30, 0.01),), np.ones(1, bool))
 rng = np.random.default_rng(20261122)
@@ -90,6 +92,7 @@ from flexdt.twin.reconstruction.feldkamp.backprojection import OnDevice
 from tests.twin.reconstruction.scans import ball, circle
 
 gpu_reconstruction_kernels.BLOCK = gpu_reconstruction_kernels.PLANE = (4, 2)
+gpu_reconstruction_kernels.THREADS = 8
 assert gpu.availability().present
 gpu.LINEAR, shape = 16, (9, 11)
 real, made = OnDevice.__init__, []
@@ -209,10 +212,12 @@ from flexdt.twin.projection import gpu
 from flexdt.twin.projection.kernels import gpu_kernels
 from flexdt.twin.reconstruction import Grid, fdk_parts, tv
 from flexdt.twin.reconstruction.feldkamp.fdk import OnDevice, OnProcessor
+from flexdt.twin.reconstruction.kernels import gpu_reconstruction_kernels
 from tests.support.device_simulator import as_on_a_device
 from tests.twin.reconstruction.scans import ball, circle
 
 as_on_a_device()
+gpu_reconstruction_kernels.THREADS = 8
 rng = np.random.default_rng(int(sys.argv[1]))
 aside, yaw = rng.uniform(-2, 2), rng.uniform(-0.1, 0.1)
 scan = circle(int(rng.integers(4, 8)), pixel=6.0, aside=aside, yaw=yaw)

@@ -54,6 +54,27 @@ def occupied(flat, stride_x, stride_y, nz, first, last, first_y, last_y):
             last[y, x] = high
 
 
+CHECKED = 1 << 16
+"""Numbers that a thread checks at a time."""
+SIZE_BITS, INFINITE = np.uint32(0x7FFFFFFF), np.uint32(0x7F800000)
+"""Bits of a float32 without its sign, and these of infinity: NaN's are more."""
+
+
+@parallel
+def unfit_parts(bits):
+    """Count the runs of `CHECKED` float32 numbers, given as uint32, with one that is not finite."""
+    runs = (bits.size + CHECKED - 1) // CHECKED
+    unfit = 0
+    for run in prange(runs):
+        some = bits[run * CHECKED : min(bits.size, (run + 1) * CHECKED)]
+        most = np.uint32(0)
+        for i in range(len(some)):
+            most = max(most, np.uint32(some[i] & SIZE_BITS))
+        if most >= INFINITE:
+            unfit += 1
+    return unfit
+
+
 @parallel
 def touch(flat):
     """Write a zero into every page of fresh zeros: threads get pages of their own at the same time,

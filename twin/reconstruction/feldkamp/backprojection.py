@@ -11,13 +11,15 @@ from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Volume, gpu
 from flexdt.twin.projection.cpu import threads
 from flexdt.twin.reconstruction.acquisition.coverage import first_and_steps
 from flexdt.twin.reconstruction.feldkamp.fdk_views import Views
-from flexdt.twin.reconstruction.feldkamp.filtering import filtered, taps
+from flexdt.twin.reconstruction.feldkamp.filtering import filtered, response_of_length, taps
+from flexdt.twin.reconstruction.feldkamp.image_upload import ImageUpload
 from flexdt.twin.reconstruction.feldkamp.noise import NoiseMeter
 
 MOST_COLUMNS: Final = 65_535
@@ -97,9 +99,9 @@ def _weighed(views: Views) -> Float32Array:
 class OnDevice:
     """On a CUDA device, circles only: images go there, and the volume comes back.
 
-    Images are copied, or widened by all cores, into one of two page-locked buffers while the device
-    works on the other. The filter is a plain convolution with the taps of its response, a product
-    for each pair of pixels of a row, without a library for Fourier transforms there.
+    Images are uploaded while the device works on earlier ones. Rows are continued, weighed and
+    filtered there two at a time, by a Fourier transform in the memory of a block; rows too long for
+    it are continued by the processor and convolved, a product for each pair of pixels.
 
     Attributes:
         meter: finds the noise from two more volumes on its coarse grid: of the views that count
@@ -111,9 +113,10 @@ class OnDevice:
 
     def __init__(self, like: Volume) -> None:
         nz, ny, nx = like.shape
-        self._shape, self._turn = (ny, nx, nz), 0
-        self._buffers: dict[int, tuple[Any, Any]] = {}
+        self._shape = (ny, nx, nz)
         self._halves: list[tuple[Any, Any]] = []
+        self._filter: tuple[Any, ...] = ()
+        self._room: Any = None
         self.meter: NoiseMeter | None = None
 
         def prepare() -> None:
@@ -121,22 +124,34 @@ class OnDevice:
 
             self._grid = [cuda.to_device(np.array(numbers)) for numbers in first_and_steps(like)]
             self._flat, self._stream = gpu.zeros(ny * nx * nz), cuda.stream()
+            self._upload = ImageUpload(self._stream)
 
         gpu.demand(prepare)
 
     def add(self, views: Views) -> None:
         """See `OnProcessor`."""
-        ends = len(views.images), len(views.images)
+        signs = np.zeros(len(views.images), np.float32)
         if self.meter is not None:
             signs = self.meter.note(views)
-            views = views.of(np.argsort(-signs, kind="stable"))
-            ends = int((signs > 0.0).sum()), int((signs >= 0.0).sum())
-        gpu.demand(lambda: self._add(views, *ends))
+        order = np.argsort(-signs, kind="stable")
+        ends = int((signs > 0.0).sum()), int((signs >= 0.0).sum())
+        gpu.demand(lambda: self._add(views.without_images(order), order, *ends))
 
-    def _add(self, views: Views, plus: int, minus: int) -> None:
-        """Weigh, filter and add images; the first `plus` count so in the noise, those from `minus`
-        on with a minus."""
-        ready = self._filtered(views)
+    def _add(self, views: Views, order: npt.NDArray[np.intp], plus: int, minus: int) -> None:
+        """Weigh, filter and add images, which are in the order that they came in.
+
+        Args:
+            views: what is known of them, in `order`.
+            order: number of the image of each.
+            plus: so many of the first count with a plus in the noise.
+            minus: those from this one on count with a minus.
+        """
+        self._upload.begin()
+        length = padded_power(views)
+        if length:
+            ready = self._transformed(views, order, length)
+        else:
+            ready = self._convolved(replace(views, images=views.images[order]))
         n, _, cols, rows = views.sizes
         self._backproject(ready, (cols, rows), views.table, self._grid, self._flat, self._shape)
         if self.meter is not None:
@@ -148,31 +163,79 @@ class OnDevice:
                         ready[some], (cols, rows), views.table[some], grid, flat, shape
                     )
 
-    def _filtered(self, views: Views) -> Any:
+    def _transformed(self, views: Views, order: npt.NDArray[np.intp], length: int) -> Any:
         """Columns of the images on the device, weighed and filtered, (n, cols, rows)."""
+        from flexdt.twin.reconstruction.kernels import gpu_reconstruction_kernels as kernels
+
+        upload, on = self._upload, views.beyond
+        shown = views.shown
+        there = upload.images(views.images, order, shown)
+        tables = [
+            upload.table("factors", views.factors), upload.table("across", views.across),
+            upload.table("up", views.up), upload.table("lengths", views.prism_lengths()),
+        ]  # fmt: skip
+        if not self._filter:
+            self._filter = self._filter_tables(views, length)
+        upload.hand_over()
+        n, _, cols, rows = views.sizes
+        ready = self._ready(n, cols, rows)
+        kernels.filter_rows[(-(-rows // 2), n), kernels.THREADS, self._stream](
+            there, views.top - shown.start, views.before, on.edge, *tables,
+            *self._filter, views.kept.start, ready,
+        )  # fmt: skip
+        upload.end()
+        return ready
+
+    def _filter_tables(self, views: Views, length: int) -> tuple[Any, ...]:
+        """What all chunks share: how rows go on, the response, and the transform's factors."""
+        from numba import cuda
+
+        on, turn = views.beyond, 2.0 * np.pi * np.arange(length // 2) / length
+        response = response_of_length(views.response, length) / length
+        response = np.concatenate([response, response[-2:0:-1]])[bits_reversed(length)]
+        tables = (on.share, on.cut, on.fade, response, np.cos(turn), np.sin(turn))
+        return (
+            cuda.to_device(on.band.astype(np.int32)),
+            *(cuda.to_device(np.asarray(table, np.float32)) for table in tables),
+        )
+
+    def _convolved(self, views: Views) -> Any:
+        """As `_transformed`, of rows of any length."""
         from numba import cuda
 
         from flexdt.twin.reconstruction.kernels import gpu_reconstruction_kernels as kernels
 
-        there, top = self._moved(views), 0 if views.wider else views.top
         n, wide, cols, rows = views.sizes
-        stream = self._stream
-
-        def small(values: FloatArray) -> Any:
-            return cuda.to_device(np.ascontiguousarray(values, dtype=np.float32), stream)
+        upload, stream = self._upload, self._stream
+        lines = np.empty((n, rows, wide), np.float32)
+        views.widen(lines)
+        there = upload.images(lines, np.arange(n), slice(0, rows))
+        tables = [
+            upload.table("factors", views.factors), upload.table("across", views.across),
+            upload.table("up", views.up),
+            upload.table("taps", taps(views.response, wide, kernels.RUN)),
+        ]  # fmt: skip
+        upload.hand_over()
 
         def plane(columns: int) -> tuple[int, int, int]:
             return -(-rows // kernels.PLANE[0]), -(-columns // kernels.PLANE[1]), n
 
         weighted = cuda.device_array((n, wide, rows), np.float32, stream=stream)
-        kernels.weigh[plane(wide), (*kernels.PLANE, 1), stream](
-            there, top, small(views.factors), small(views.across), small(views.up), weighted
-        )  # fmt: skip
-        ready = cuda.device_array((n, cols, rows), np.float32, stream=stream)
+        kernels.weigh[plane(wide), (*kernels.PLANE, 1), stream](there, 0, *tables[:3], weighted)
+        ready = self._ready(n, cols, rows)
         kernels.convolve[plane(-(-cols // kernels.RUN)), (*kernels.PLANE, 1), stream](
-            weighted, small(taps(views.response, wide, kernels.RUN)), views.kept.start, ready
+            weighted, tables[3], views.kept.start, ready
         )
+        upload.end()
         return ready
+
+    def _ready(self, n: int, cols: int, rows: int) -> Any:
+        """Memory of the device for filtered columns, (n, cols, rows)."""
+        from numba import cuda
+
+        if self._room is None or self._room.size < n * cols * rows:
+            self._room = cuda.device_array(n * cols * rows, np.float32)
+        return self._room[: n * cols * rows].reshape(n, cols, rows)
 
     def _backproject(
         self,
@@ -205,31 +268,12 @@ class OnDevice:
             self._halves = [(grid, gpu.zeros(self.meter.data.size)) for _ in range(2)]
         return self._halves
 
-    def _moved(self, views: Views) -> Any:
-        """Images on the device, by page-locked memory, from where copies are not waited for."""
-        from numba import cuda
-
-        n, wide, _, rows = views.sizes
-        shape = (rows, wide) if views.wider else views.images.shape[1:]
-        self._turn = 1 - self._turn
-        buffer, copied = self._buffers.get(self._turn, (None, None))
-        if copied is not None:
-            copied.synchronize()
-        if buffer is None or len(buffer) < n:
-            buffer = cuda.pinned_array((n, *shape), np.float32)
-        part = buffer[:n]
-        if views.wider:
-            views.widen(part)
-        else:
-            np.copyto(part, views.images)
-        there, copied = cuda.to_device(part, self._stream), cuda.event()
-        copied.record(self._stream)
-        self._buffers[self._turn] = buffer, copied
-        return there
-
     def volume(self) -> Float32Array:
         """See `OnProcessor`."""
+        from flexdt.twin.projection.kernels import layout_kernels
+
         out = np.empty(self._shape, np.float32)
+        layout_kernels.touch(out.reshape(-1))  # while the device is still at work
 
         def fetch() -> None:
             self._stream.synchronize()
@@ -240,6 +284,23 @@ class OnDevice:
 
         gpu.demand(fetch)
         return out
+
+
+def padded_power(views: Views) -> int:
+    """Count the columns of a row padded to a power of 2; 0 where the device has no room for it."""
+    from flexdt.twin.reconstruction.kernels import gpu_reconstruction_kernels as kernels
+
+    least = max(2 * views.reach - 1, views.factors.shape[1], 2)
+    length = 1 << (least - 1).bit_length()
+    return length if length <= kernels.LENGTH else 0
+
+
+def bits_reversed(length: int) -> npt.NDArray[np.intp]:
+    """Numbers below a power of 2 with their bits in reversed order, (length,)."""
+    order = np.zeros(1, np.intp)
+    while len(order) < length:
+        order = np.concatenate([2 * order, 2 * order + 1])
+    return order
 
 
 Backprojector = OnProcessor | OnDevice

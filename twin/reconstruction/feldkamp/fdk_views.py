@@ -66,13 +66,42 @@ class Views:
             return self.images[:, self.top : last]
         return self.images[:, np.arange(self.top, last).clip(0, count - 1)]
 
+    @property
+    def shown(self) -> slice:
+        """The panel's rows that are needed, or that rows off the panel repeat."""
+        count = self.images.shape[1]
+        first = min(max(self.top, 0), count - 1)
+        return slice(first, min(max(self.top + self.up.shape[1], first + 1), count))
+
     def of(self, which: slice | npt.NDArray[np.intp]) -> Views:
         """Some of these views."""
+        return replace(self.without_images(which), images=self.images[which])
+
+    def without_images(self, which: slice | npt.NDArray[np.intp]) -> Views:
+        """What is known of some of these views, beside the images of all."""
         return replace(
-            self, images=self.images[which], beyond=self.beyond.of(which),
+            self, beyond=self.beyond.of(which),
             factors=self.factors[which], across=self.across[which], up=self.up[which],
             shares=self.shares[which], table=self.table[which],
         )  # fmt: skip
+
+    @property
+    def reach(self) -> int:
+        """Least distance in columns between two that do not act on each other."""
+        return int(max(self.factors.shape[1] - self.kept.start, self.kept.stop))
+
+    def prism_lengths(self) -> Float32Array:
+        """Compute what prisms add to rows beyond the panel's edges, (n, bands, columns) [1/mm].
+
+        See `truncation_kernels.prism_lengths`.
+        """
+        from flexdt.twin.reconstruction.kernels import truncation_kernels
+
+        on, cols = self.beyond, self.images.shape[2]
+        n, wide = self.factors.shape
+        out = np.empty((n, len(on.prisms), wide), np.float32)
+        truncation_kernels.prism_lengths(self.before, cols, on.edge, on.plane, on.prisms, out)
+        return out
 
     def widen(self, out: Float32Array) -> None:
         """Write the rows that are needed, continued beyond the panel's edges, (n, rows, cols)."""
@@ -80,8 +109,8 @@ class Views:
 
         on = self.beyond
         truncation_kernels.continue_rows(
-            np.ascontiguousarray(self.images), self.top, self.before, on.edge, on.plane, on.prisms,
-            on.band, on.share, on.cut, on.fade, self.across, self.up, out,
+            np.ascontiguousarray(self.images), self.top, self.before, on.edge,
+            self.prism_lengths(), on.band, on.share, on.cut, on.fade, self.across, self.up, out,
         )  # fmt: skip
 
 

@@ -72,3 +72,16 @@ def taps(response: Float32Array, wide: int, more: int) -> FloatArray:
     """Compute the filter in space, by the distance in columns: (wide + more,)."""
     values = np.fft.irfft(response.astype(np.float64), padded_length(response))[:wide]
     return np.pad(values, (0, wide - len(values) + more))
+
+
+def response_of_length(response: Float32Array, length: int) -> FloatArray:
+    """Compute the response of the same filter on rows padded to another length, (length / 2 + 1,).
+
+    Columns are right as far as both lengths allow: half of the shorter one.
+
+    Args:
+        response: of `ramp`.
+        length: of a padded row [columns], even.
+    """
+    half = taps(response, length // 2 + 1, 0)
+    return np.asarray(np.fft.rfft(np.concatenate([half, half[-2:0:-1]])).real)

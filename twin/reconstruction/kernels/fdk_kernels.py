@@ -478,6 +478,14 @@ def weigh(images, first, factors, across, up, out):
 
 
 @parallel
+def copy_rows(images, order, first, out):
+    """out[n, r, c] = images[order[n], first + r, c], float32, on all cores."""
+    n, rows, _ = out.shape
+    for job in prange(n * rows):
+        out[job // rows, job % rows] = images[order[job // rows], first + job % rows]
+
+
+@parallel
 def respond(spectra, response):
     """spectra *= response: float32 (n, frequencies, 2), real and imaginary part, (frequencies,)."""
     for k in prange(len(spectra)):

@@ -92,6 +92,140 @@ def convolve(weighted, taps, start, out):
             out[view, c + m, r] = acc[m]
 
 
+LENGTH = 4096
+"""Columns of a padded row, at most: two rows of so many have room in a block's shared memory."""
+THREADS = 256
+"""Threads a block of `filter_rows`, which takes two rows."""
+SIDES = 128
+"""Partial sums over the two edges of two rows: 32 of each."""
+
+
+@cuda.jit(device=True, inline=True)
+def prism_path(lengths, view, low, share, slant, c):
+    """Path length times attenuation, of a ray `slant` times as long as its horizontal part."""
+    high = min(low + 1, lengths.shape[1] - 1)
+    lower = lengths[view, low, c]
+    return (lower + share * (lengths[view, high, c] - lower)) * slant
+
+
+@cuda.jit(device=True, inline=True)
+def edge_sum(images, top, lengths, band, share, across, up, before, edge, view, r, side, part):
+    """A 32nd of the sum, over an edge's columns, of a row less the prisms' path lengths."""
+    row = min(max(top + r, 0), images.shape[1] - 1)
+    first = images.shape[2] - edge if side else 0
+    total = np.float32(0)
+    for c in range(first + part, first + edge, 32):
+        slant = math.sqrt(across[view, before + c] + up[view, r])
+        path = prism_path(lengths, view, band[r], share[r], slant, before + c)
+        total += images[view, row, c] - path
+    return total
+
+
+@cuda.jit(device=True, inline=True)
+def weighted_pixel(
+    images, top, factors, across, up, lengths, band, share, fade, before, rests, view, r, c, which
+):
+    """A column of a widened row with FDK's weight; see `fdk_kernels.weigh` and `continue_rows`.
+
+    rests: what prisms leave at the low (2 `which`) and the high edge (2 `which` + 1) of the row.
+    """
+    slant = math.sqrt(across[view, c] + up[view, r])
+    if c < before or c >= before + images.shape[2]:
+        rest = rests[2 * which + (1 if c >= before else 0)]
+        value = prism_path(lengths, view, band[r], share[r], slant, c) + rest * fade[c]
+    else:
+        value = images[view, min(max(top + r, 0), images.shape[1] - 1), c - before]
+    return value * (factors[view, c] / slant)
+
+
+@cuda.jit
+def filter_rows(
+    images, top, before, edge, factors, across, up, lengths, band, share, cut, fade, response,
+    cosines, sines, start, out,
+):  # fmt: skip
+    """Continue rows beyond the panel's edges, weigh and filter them.
+
+    A block takes two rows as the real and the imaginary part of one signal, through a Fourier
+    transform in its shared memory, forward to the order of reversed bits and back from it.
+
+    images: float32 (n, rows of the panel, cols); row `top` is the first that is needed.
+    before: columns that go into the filter before the panel's first.
+    edge: columns at an edge whose mean goes on; 0 where no column lies beyond.
+    factors, across, up: float32 (n, wide), (n, wide), (n, rows) of `fdk_kernels.weigh`.
+    lengths, band, share, cut, fade: of `truncation_kernels.continue_rows`, float32 and int32.
+    response: float32 (length,) over the length, a power of 2, in the order of reversed bits.
+    cosines, sines: float32 (length / 2,) of 2 pi k / length.
+    out: float32 (n, cols, rows), from column `start` of the filtered rows on.
+    """
+    real = cuda.shared.array(4096, np.float32)
+    imaginary = cuda.shared.array(4096, np.float32)
+    rests = cuda.shared.array(4, np.float32)
+    thread, view = cuda.threadIdx.x, cuda.blockIdx.y
+    length, wide, rows = response.size, factors.shape[1], out.shape[2]
+    r = 2 * cuda.blockIdx.x
+    second = min(r + 1, rows - 1)
+    for part in range(thread, SIDES, THREADS):
+        which = part // 32
+        row = second if which >= 2 else r
+        real[part] = edge_sum(
+            images, top, lengths, band, share, across, up, before, edge, view, row, which % 2,
+            part % 32,
+        )  # fmt: skip
+    cuda.syncthreads()
+    for which in range(thread, 4, THREADS):
+        total = np.float32(0)
+        for part in range(32):
+            total += real[which * 32 + part]
+        row = second if which >= 2 else r
+        rests[which] = total * cut[row] / np.float32(max(edge, 1))
+    cuda.syncthreads()
+    for c in range(thread, length, THREADS):
+        a, b = np.float32(0), np.float32(0)
+        if c < wide:
+            a = weighted_pixel(
+                images, top, factors, across, up, lengths, band, share, fade, before, rests, view,
+                r, c, 0,
+            )  # fmt: skip
+            b = weighted_pixel(
+                images, top, factors, across, up, lengths, band, share, fade, before, rests, view,
+                second, c, 1,
+            )  # fmt: skip
+        real[c], imaginary[c] = a, b
+    half, step = narrow(length // 2), narrow(1)
+    while half > 0:
+        cuda.syncthreads()
+        for j in range(thread, length // 2, THREADS):
+            k = j & (half - 1)
+            low, high = place(2 * j - k), place(2 * j - k + half)
+            cosine, sine = cosines[place(k * step)], sines[place(k * step)]
+            a, b, c, d = real[low], imaginary[low], real[high], imaginary[high]
+            real[low], imaginary[low] = a + c, b + d
+            c, d = a - c, b - d
+            real[high], imaginary[high] = c * cosine + d * sine, d * cosine - c * sine
+        half, step = narrow(half // 2), narrow(step * 2)
+    cuda.syncthreads()
+    for c in range(thread, length, THREADS):
+        real[c] *= response[c]
+        imaginary[c] *= response[c]
+    half, step = narrow(1), narrow(length // 2)
+    while half < length:
+        cuda.syncthreads()
+        for j in range(thread, length // 2, THREADS):
+            k = j & (half - 1)
+            low, high = place(2 * j - k), place(2 * j - k + half)
+            cosine, sine = cosines[place(k * step)], sines[place(k * step)]
+            a, b, c, d = real[low], imaginary[low], real[high], imaginary[high]
+            c, d = c * cosine - d * sine, d * cosine + c * sine
+            real[low], imaginary[low] = a + c, b + d
+            real[high], imaginary[high] = a - c, b - d
+        half, step = narrow(half * 2), narrow(step // 2)
+    cuda.syncthreads()
+    for c in range(thread, out.shape[1], THREADS):
+        out[view, c, r] = real[start + c]
+        if r + 1 < rows:
+            out[view, c, r + 1] = imaginary[start + c]
+
+
 @cuda.jit
 def backproject(images, cols, rows, views, first, size, volume):
     """Add views to a volume.

@@ -69,18 +69,39 @@ def _continue_side(out, first, last, lower, upper, share, across, high, rest, fa
 
 
 @parallel
-def continue_rows(
-    images, first, before, edge, plane, prisms, band, share, cut, fade, across, up, out
-):
+def prism_lengths(before, cols, edge, plane, prisms, out):
+    """Compute the horizontal path lengths times attenuation of prisms beyond a panel's edges.
+
+    before, cols: columns before the panel's first, and of the panel.
+    edge: columns at an edge whose mean goes on.
+    plane: (n, 6) source, ray to the first column of `out`, and step from column to column, x and y
+        [mm].
+    prisms: (k, 6) of `_chord`.
+    out: float32 (n, k, wide), over the horizontal length of the ray [1/mm]; 0 in columns of the
+        panel that are not at an edge.
+    """
+    n, bands, wide = out.shape
+    after = before + cols
+    for job in prange(n * bands):
+        view = job // bands
+        k = job % bands
+        g = plane[view]
+        for c in range(wide):
+            length = 0.0
+            if prisms[k, 5] > 0.0 and (c < before + edge or c >= after - edge):
+                length = _chord(prisms[k], g[0], g[1], g[2] + c * g[4], g[3] + c * g[5])
+            out[view, k, c] = np.float32(length)
+
+
+@parallel
+def continue_rows(images, first, before, edge, lengths, band, share, cut, fade, across, up, out):
     """Widen rows beyond the panel's edges.
 
     images: float32 (n, rows of the panel, cols).
     first: row of the panel that is the first of `out`; rows beyond it repeat its outermost ones.
     before: columns of `out` before the panel's first.
     edge: columns at an edge whose mean goes on.
-    plane: (n, 6) source, ray to the first column of `out`, and step from column to column, x and y
-        [mm].
-    prisms: (k, 6) of `_chord`.
+    lengths: (n, bands, wide) of `prism_lengths`.
     band, share: (rows,) lower band of each row, and how much the next one counts.
     cut: (rows,) how much of what the prisms leave at the edges goes on.
     fade: (wide,) part of it that is left in each column.
@@ -90,18 +111,7 @@ def continue_rows(
     n, rows, wide = out.shape
     cols = images.shape[2]
     after = before + cols
-    bands = len(prisms)
-    lengths = np.zeros((n, bands, wide), np.float64)
-    for job in prange(n * bands):
-        view = job // bands
-        k = job % bands
-        if prisms[k, 5] > 0.0:
-            g = plane[view]
-            for c in range(wide):
-                if c < before + edge or c >= after - edge:
-                    lengths[view, k, c] = _chord(
-                        prisms[k], g[0], g[1], g[2] + c * g[4], g[3] + c * g[5]
-                    )
+    bands = lengths.shape[1]
     for job in prange(n * rows):
         view = job // rows
         r = job % rows

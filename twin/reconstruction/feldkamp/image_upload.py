@@ -1,0 +1,119 @@
+"""Upload images to a CUDA device through page-locked memory while it works on earlier ones.
+
+All cores copy a portion into page-locked memory, from where the device fetches it by itself. Two
+portions take turns, small enough that page-locking them costs little.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+
+PORTION_BYTES: Final = 24 * 2**20
+"""Page-locked memory of each of the two portions, at least one image."""
+
+
+class ImageUpload:
+    """Upload images and small tables on a stream of their own.
+
+    Args:
+        stream: of the kernels that read what is uploaded.
+    """
+
+    def __init__(self, stream: Any) -> None:
+        from numba import cuda
+
+        self._reader, self._writer = stream, cuda.stream()
+        self._turn = 0
+        self._portions: list[Any] = [None, None]
+        self._fetched: list[Any] = [None, None]
+        self._rooms: dict[str, list[Any]] = {}
+        self._read: list[Any] = [None, None]
+        self._chunk = 0
+
+    def begin(self) -> None:
+        """Begin the next chunk of views, in the memory of the chunk before the last."""
+        self._chunk = 1 - self._chunk
+        if self._read[self._chunk] is not None:
+            self._read[self._chunk].wait(self._writer)
+
+    def images(self, images: Float32Array, order: npt.NDArray[np.intp], rows: slice) -> Any:
+        """Upload some rows of images, (n, rows.stop - rows.start, cols).
+
+        Args:
+            images: (n, rows, cols).
+            order: number of the image that goes to each place, (n,).
+            rows: that are uploaded.
+        """
+        from flexdt.twin.reconstruction.kernels import fdk_kernels
+
+        images = np.ascontiguousarray(images)
+        n, cols = len(order), images.shape[2]
+        count = rows.stop - rows.start
+        there = self._room("images", n * count * cols).reshape(n, count, cols)
+        each = max(1, PORTION_BYTES // max(1, 4 * count * cols))
+        for first in range(0, n, each):
+            some = min(each, n - first)
+            portion = self._portion(some * count * cols).reshape(some, count, cols)
+            fdk_kernels.copy_rows(images, order[first : first + some], rows.start, portion)
+            self._fetch(portion, there[first : first + some])
+        return there
+
+    def table(self, name: str, values: FloatArray | Float32Array) -> Any:
+        """Upload a table of single precision; tables of one name share their memory."""
+        there = self._room(name, values.size).reshape(values.shape)
+        portion = self._portion(values.size).reshape(values.shape)
+        np.copyto(portion, values, casting="same_kind")
+        self._fetch(portion, there)
+        return there
+
+    def hand_over(self) -> None:
+        """Let the kernels that are launched from now on wait for what has been uploaded."""
+        from numba import cuda
+
+        done = cuda.event()
+        done.record(self._writer)
+        done.wait(self._reader)
+
+    def end(self) -> None:
+        """Say that the last kernel that reads this chunk has been launched."""
+        from numba import cuda
+
+        done = cuda.event()
+        done.record(self._reader)
+        self._read[self._chunk] = done
+
+    def _room(self, name: str, count: int) -> Any:
+        """Memory of the device for one array of this chunk, (count,)."""
+        from numba import cuda
+
+        pair = self._rooms.setdefault(name, [None, None])
+        if pair[self._chunk] is None or pair[self._chunk].size < count:
+            pair[self._chunk] = cuda.device_array(count, np.float32)
+        return pair[self._chunk][:count]
+
+    def _portion(self, count: int) -> Any:
+        """Page-locked memory that the device has fetched everything from, (count,)."""
+        from numba import cuda
+
+        self._turn = 1 - self._turn
+        if self._fetched[self._turn] is not None:
+            self._fetched[self._turn].synchronize()
+        portion = self._portions[self._turn]
+        if portion is None or portion.size < count:
+            size = max(count, PORTION_BYTES // 4)
+            portion = self._portions[self._turn] = cuda.pinned_array(size, np.float32)
+        return portion[:count]
+
+    def _fetch(self, portion: Any, there: Any) -> None:
+        """Let the device fetch the portion whose turn it is."""
+        from numba import cuda
+
+        there.copy_to_device(portion, self._writer)
+        fetched = cuda.event()
+        fetched.record(self._writer)
+        self._fetched[self._turn] = fetched
