@@ -266,9 +266,13 @@ def run(check: Check, sizes: Sizes) -> None:
             found = fdk_part(short, what, errors, 3.0 * spent.get((what, False), 4.0))
             if found is not None:
                 spent[what, errors] = found["seconds"]
+    for what in FDK_OBJECTS:
+        if (what, False) in spent:
+            fdk_part(long, what, False, 2.4 * spent[what, False] * long / short + 10.0)
     check.part("1024^3", 45.0, lambda: projections("1024^3", sizes))
     for (what, errors), seconds in sorted(spent.items(), key=lambda item: item[1]):
-        fdk_part(long, what, errors, 2.4 * seconds * long / short + 10.0)
+        if errors:
+            fdk_part(long, what, errors, 2.4 * seconds * long / short + 10.0)
 
 
 def main() -> int:
@@ -289,7 +293,10 @@ def main() -> int:
     if options.tiny:
         from device_simulator import as_on_a_device
 
+        from flexdt.measuring import gpu_fdk_kernels
+
         as_on_a_device()
+        gpu_fdk_kernels.THREADS = 8
         gpu.LINEAR = 64
         sizes = TINY
         device_page.by_events = device_page.on_the_clock  # the simulator has no clock of its own

@@ -29,10 +29,11 @@ MOST_ERROR = 3e-6
 """Of the maximum of an image, or of the volume that the adjoint gives."""
 KINDS = (
     "diagonal", "level", "rolled", "turned", "source inside", "pixels inside", "one row",
-    "one column", "along z", "steep", "far",
+    "one column", "along z", "steep", "far", "upright",
 )  # fmt: skip
 """Geometries, drawn in turns; `rolled` panels are turned by 30 to 60 degrees about the beam, and
-`diagonal` ones, too, where rays of one warp run along x and along y."""
+`diagonal` ones, too, where rays of one warp run along x and along y. Columns of `upright` panels
+are parallel to z, either way up."""
 AROUND = 64
 """Cells before and behind the volume's, beside as many as it has."""
 Floats = npt.NDArray[np.float64]
@@ -155,6 +156,8 @@ def drawn_view(draw: Draw, kind: str, radius: float, shape: tuple[int, int]) -> 
     u, v = np.array([-s, c, 0.0]), np.array([up * c, up * s, -out])
     for axis, angle in ((v, yaw), (u, pitch), (beam, roll)):
         u, v = turned(u, axis, angle), turned(v, axis, angle)
+    if kind == "upright":
+        u[2], v = 0.0, np.array([0.0, 0.0, draw.choice([-1.0, 1.0])])
     magnified = (away + behind) / max(away, 0.3 * radius)
     spans = 2 * radius * magnified * draw.uniform(0.5, 1.1, 2) / np.array(shape)
     # A pixel about the panel's middle looks at the volume's centre: something is seen.

@@ -428,7 +428,7 @@ def column_kernel(transposed):
                     y = fused(np.float32(k), slope_z, distance_z)
                     floor, z = floor_bits(y)
                     z = narrow(low_z + (z + plane_z) * hop_z)
-                    ahead = ((floor - distance_z) + ONE) * steps_z
+                    ahead = ((floor + ONE) - distance_z) * steps_z  # exact where it is near
                 t = np.float32(k)
                 while k < stop:
                     jump, h = unpacked(pairs[place(own + k)])
