@@ -42,8 +42,8 @@ def named(function: Any) -> set[str]:
 
 def test_python_and_the_command_have_the_same_options() -> None:
     declared = set(CalibrationOptions.__annotations__)
-    assert named(fx.calibrate) == declared | {"data", "phantom", "geometry"}
-    assert named(fx.DataSet.calibrate) == declared | {"self", "phantom", "geometry"}
+    assert named(fx.calibrate) == declared | {"data", "phantom", "geometry", "progress"}
+    assert named(fx.DataSet.calibrate) == declared | {"self", "phantom", "geometry", "progress"}
     command = {RENAMED.get(n, n) for n in named(calibrate_commands.calibrate)}
     settings = {f.name for f in fields(CalibrateSettings)} - {"command"}
     assert (command | settings) - OF_FILES - OF_THE_TWIN == declared | {"phantom"}

@@ -20,6 +20,7 @@ ROOT = Path(__file__).resolve().parents[2]
 TEMPLATE = "flexdt/library/report_page.py"
 NO_PAGES = {
     "flexdt/library/datasets/notebook_html.py",  # values in a notebook
+    "flexdt/library/notebook/notebook_pages.py",  # values in a notebook, with sliders
     "flexdt/library/figures.py",  # finds the SVG in what matplotlib writes
     "twin/projection/volume.py",  # a value in a notebook
     "twin/geometry/cone_vec.py",  # a value in a notebook
