@@ -35,7 +35,7 @@ from flexdt.clients.cli.commands import scanner_commands as scanner
 from flexdt.clients.cli.commands import script_commands as scripts
 from flexdt.clients.cli.completed_commands import completed
 from flexdt.clients.cli.console import hush, note, printable, speak
-from flexdt.clients.cli.options import Json, Quiet, Server, TokenFile, Verbose, argument, option
+from flexdt.clients.cli.options import Json, Server, TokenFile, Verbose, argument, option
 
 COMMANDS: Final[Mapping[str, Callable[..., object]]] = {
     name.strip("_"): getattr(module, name)
@@ -186,11 +186,10 @@ def build(words: Sequence[str] | None = None) -> typer.Typer:
         json: Json = False,
         server: Server = None,
         token_file: TokenFile = None,
-        quiet: Quiet = False,
-        verbose: Verbose = False,
+        verbose: Verbose = None,
     ) -> None:
         """What these options say, `completed` commands take from the context."""
-        speak(quiet, verbose)
+        speak(quiet=verbose is False, verbose=verbose is True)
 
     for name, command in COMMANDS.items():
         passes = name == "up" or name in ALONE

@@ -18,11 +18,13 @@ Answer = Iterator[object]
 """What most commands yield: texts, which are lines for people, and one thing that is no text, which
 is the document of `--json`."""
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
-Quiet = Annotated[
-    bool, typer.Option("--quiet", "-q", help="Show no progress; warnings and errors stay.")
-]
 Verbose = Annotated[
-    bool, typer.Option("--verbose", "-v", help="Say what takes time, and what libraries log.")
+    bool | None,
+    typer.Option(
+        "--verbose/--quiet",
+        "-v/-q",
+        help="Say what takes time and what libraries log; or show no progress.",
+    ),
 ]
 Proposer = Callable[[str], list[str]]
 """Gives the values that begin with the part of a word that was typed."""

@@ -18,7 +18,7 @@ from flexdt.clients.cli.command_tree import GROUPS, SECTIONS, build
 from flexdt.clients.cli.settings_file import TABLES
 from flexdt.runtime.settings import parameters
 
-MOST_OPTIONS = 216
+MOST_OPTIONS = 217
 THEIRS = ("flexdt study", "flexdt batch", "flexdt bench", "flexdt phantom design")
 PROCESSES = ("up", "twin", "projector", "viewer", "gateway")
 ROOT = Path(__file__).parents[2]
