@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -82,3 +83,13 @@ def test_every_claim_on_the_peers_page_has_its_command_or_source() -> None:
         assert (ROOT / path).exists(), path
     columns = {len(re.findall(r"(?<!\\)\|", row)) for row in table.splitlines() if row[:1] == "|"}
     assert len(columns) == 1
+
+
+@pytest.mark.parametrize("page", [*PAGES, *evidence()], ids=lambda p: p.name)
+def test_headings_go_down_one_level_at_a_time(page: Path) -> None:
+    """What Sphinx warns of, and a warning ends the build."""
+    text = evidence()[page] if page.suffix == ".json" else page.read_text()
+    plain = re.sub(r"^```.*?^```|^---$.*?^---$", "", text, flags=re.MULTILINE | re.DOTALL)
+    levels = [len(marks) for marks in re.findall(r"^(#+) ", plain, re.MULTILINE)]
+    assert levels[:1] == [1]
+    assert all(after <= before + 1 for before, after in pairwise(levels)), levels
