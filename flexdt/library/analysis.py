@@ -128,7 +128,8 @@ def reconstruct(
         iterations: of an iterative algorithm; default: its own.
         weight: of the total variation (tv); default: its own.
         window: of FDK's ramp filter: ram-lak, shepp-logan, cosine, hamming, hann.
-        rings: correct for rings, as far as they stand out from the noise (full turns).
+        rings: subtract what pixels add to all views, where that stands out from object and noise;
+            whole columns in full turns alone.
         material: the object is made of this alone: correct beam hardening. For sirt and sart also
             all the materials it is made of.
         scatter_correction: the material that the object is made of, or all of them: simulate its

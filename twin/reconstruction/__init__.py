@@ -6,6 +6,7 @@ from flexdt.twin.reconstruction.acquisition.rectify import field_of_view
 from flexdt.twin.reconstruction.acquisition.truncation import Truncation, truncation_of
 from flexdt.twin.reconstruction.bias import Bias, bias_of
 from flexdt.twin.reconstruction.checked_fdk import bias_warnings, checked_fdk, fdk
+from flexdt.twin.reconstruction.consistency.ring_pattern import ring_errors
 from flexdt.twin.reconstruction.feldkamp.fdk import fdk_parts
 from flexdt.twin.reconstruction.iterative import cgls, em, sart, sirt
 from flexdt.twin.reconstruction.linear_system import Step
@@ -13,7 +14,6 @@ from flexdt.twin.reconstruction.scatter_correction import (
     Hardening,
     Polychromatic,
     hardening,
-    ring_errors,
     without_scatter,
 )
 from flexdt.twin.reconstruction.tv import Minimised, minimise_tv, tv

@@ -1,9 +1,8 @@
-"""What is taken out of a scan's line integrals before reconstruction: rings, hardening, scatter.
+"""What is taken out of a scan's line integrals before reconstruction: hardening, scatter.
 
-A ring comes from a pixel whose error stays the same in all views. Beam hardening comes from low
-energies being absorbed first; its correction is for objects of a single material, and iterative
-methods take the hardening in several into account (`Polychromatic`). Flat field and logarithm are
-in `flexdt.twin.dataset`.
+Beam hardening comes from low energies being absorbed first; its correction is for objects of a
+single material, and iterative methods take the hardening in several into account (`Polychromatic`).
+Flat field and logarithm are in `flexdt.twin.dataset`, rings in `consistency/ring_pattern.py`.
 
 Scatter is found from the scan itself: FDK says how much the object attenuates, the names of its
 materials what it scatters. That scatter is simulated (`flexdt.twin.physics.scatter`) and subtracted
@@ -14,7 +13,7 @@ and Beekman, IEEE Trans. Med. Imaging 25 (2006) 817). Grids are coarse, since sc
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final
@@ -38,48 +37,12 @@ from flexdt.twin.reconstruction.acquisition.truncation import truncation_of
 from flexdt.twin.reconstruction.feldkamp.fdk import fdk_parts
 from flexdt.twin.signatures import public
 
-RING_WIDTH = 9
-"""Columns over which a pixel is compared with its neighbours."""
-RING_GROUP = 24
-"""Views held at a time: the median over all is taken as that of such groups' medians."""
 DEPTHS = 400
 THIN: Final = 1e-3
 """Line integral below which a spectrum attenuates as its mean does."""
 THICKEST_MM, FINE = 1e4, 2e-4
 """Paths through a material that effective energies hold for (they stop where nothing gets through),
 and the relative error of the signal that they may have."""
-
-
-def ring_errors(views: Iterable[Float32Array], width: int = RING_WIDTH) -> Float32Array:
-    """What each pixel adds to all views, to be subtracted from each.
-
-    In each view a pixel is compared with the mean of its neighbours in the row, left and right
-    alike, so that a slope does not matter. Edges of the object pass through a pixel in few views;
-    the median over views is what stood still.
-
-    Args:
-        views: (rows, cols) line integrals of all views of a turn.
-        width: columns of the neighbourhood.
-
-    Raises:
-        LimitError: no views.
-    """
-    from scipy.ndimage import uniform_filter1d
-
-    size = 2 * max(1, width // 2) + 1
-    medians: list[Float32Array] = []
-    group: list[Float32Array] = []
-    for view in views:
-        mean = uniform_filter1d(view, size, axis=1, mode="nearest")
-        group.append(np.asarray((view - mean) * np.float32(size / (size - 1)), dtype=np.float32))
-        if len(group) == RING_GROUP:
-            medians.append(np.median(group, axis=0))
-            group = []
-    if len(group) > RING_GROUP // 2 or not medians:
-        if not group:
-            raise LimitError("no views to find rings in", {"asked": 0, "allowed": "> 0"})
-        medians.append(np.median(group, axis=0))
-    return np.asarray(np.median(medians, axis=0), dtype=np.float32)
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,6 +34,7 @@ from flexdt.library.reconstruction.kept_images import (
     KeptImages,
 )
 from flexdt.library.reconstruction.memory_plan import PART, MemoryPlan, plan_memory, plan_whole
+from flexdt.library.reconstruction.ring_correction import scan_rings
 from flexdt.library.reconstruction.slab_fdk import StandingImages, Work, fdk_slabs
 from flexdt.library.reconstruction.volume_files import (
     MiddleSlices,
@@ -69,7 +70,6 @@ from flexdt.twin.reconstruction import (
     hardening,
     layer_warnings,
     lost_layers,
-    ring_errors,
     truncation_of,
     with_errors,
 )
@@ -108,7 +108,7 @@ class VolumeRequest:
         window: of FDK's ramp filter.
         center_mm: (x, y, z) of the grid; None is the middle of the field of view, or the origin
             where `shape` is given.
-        rings: correct for rings (full turns).
+        rings: subtract what pixels add to all views, where that stands out from object and noise.
         material: the object is made of this alone: correct beam hardening with the data set's
             tube (the default one where it names none); several with `sirt` and `sart` (see
             `Polychromatic`); None for no correction.
@@ -588,7 +588,7 @@ def _corrected(views: ScanFrames, request: VolumeRequest) -> ScanFrames:
     if request.scatter_correction is not None:
         views = _without_scatter(views, request.scatter_correction, request)
     if request.rings:
-        views = replace(views, rings=ring_errors(map(views.view, range(len(views.indices)))))
+        views = replace(views, rings=scan_rings(views.view, views.cone_vec, views.shape))
     if request.material is not None:
         from flexdt.phantoms.materials import material, stated_keV
 

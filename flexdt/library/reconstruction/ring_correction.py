@@ -1,0 +1,68 @@
+"""What the pixels of a scan add to all its views."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Final
+
+import numpy as np
+
+from flexdt.twin.errors import GeometryError
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.reconstruction import ring_errors
+from flexdt.twin.reconstruction.acquisition.rectify import on_its_side
+from flexdt.twin.reconstruction.acquisition.trajectory import Circle, circle_of
+
+MOST_LEAN_PX: Final = 1.0
+"""Columns between the axis at the panel's upper and lower edge, at most: beyond, columns on both
+sides of it do not see the same rays."""
+SECTORS: Final = 8
+"""Parts of a turn whose numbers of views are compared."""
+MOST_UNEVEN: Final = 1.3
+"""Views of the fullest sector over those of the emptiest, at most."""
+
+
+def scan_rings(
+    view: Callable[[int], Float32Array], cone_vec: ConeVec, shape: tuple[int, int]
+) -> Float32Array:
+    """Find what each pixel of a scan adds to all views, to be subtracted from each.
+
+    Args:
+        view: gives the line integrals of a view, (rows, cols), by its number.
+        cone_vec: of all views.
+        shape: (rows, cols).
+
+    Returns:
+        (rows, cols); 0 where nothing stands out from object and noise.
+    """
+    lies = on_its_side(cone_vec)
+    numbers = range(len(cone_vec))
+    views: Iterator[Float32Array] = (view(k).T if lies else view(k) for k in numbers)
+    found = ring_errors(views, _axis_column(cone_vec, shape, lies=lies))
+    return found.T if lies else found
+
+
+def _axis_column(cone_vec: ConeVec, shape: tuple[int, int], *, lies: bool) -> float | None:
+    """The column onto which the axis of a full turn falls, of an upright panel; else None."""
+    try:
+        circle = circle_of(cone_vec)
+    except GeometryError:
+        return None
+    if circle.rise or not circle.full or not _evenly_turned(circle):
+        return None
+    around, height = np.tile(circle.centre, (2, 1)), cone_vec.source[0, 2]
+    axis = np.column_stack([around, height + 0.01 * circle.radius * np.array([-1.0, 1.0])])
+    columns, rows = np.median(cone_vec.project_points(axis, shape), axis=0).T
+    tall = shape[0]
+    if lies:
+        columns, rows, tall = rows, columns, shape[1]
+    lean_px = tall * np.ptp(columns) / np.ptp(rows)
+    middle = float(columns.mean())
+    return middle if np.isfinite(middle) and lean_px <= MOST_LEAN_PX else None
+
+
+def _evenly_turned(circle: Circle) -> bool:
+    """Whether all directions have as many views: those of a turn and a half do not."""
+    views, _ = np.histogram(circle.angle, SECTORS, (0.0, 2.0 * np.pi))
+    return bool(views.max() <= MOST_UNEVEN * views.min() + 1.0)
