@@ -1,6 +1,7 @@
-"""What a volume's `sigma` and `bias_bound` cost: FDK without and with both, in turns.
+"""What a volume's `sigma` and `bias_bound` cost: FDK without and with both, in turns; and of it the
+comparison of images and geometry, where they fit and where all explanations are tried.
 
-    python tests/studies/noise_cost.py
+    python tests/studies/noise_cost.py [NUMBER OF CASES]
 
 Images of a cylinder that the panel sees whole, and of one that it cuts off. Processor seconds, the
 better of three.
@@ -8,6 +9,7 @@ better of three.
 
 from __future__ import annotations
 
+import sys
 import time
 import warnings
 from collections.abc import Iterator
@@ -17,10 +19,13 @@ import numpy as np
 import flexdt as fx
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.reconstruction.checked_fdk import checked_fdk
+from flexdt.twin.reconstruction.coarse_scan import CoarseScan
+from flexdt.twin.reconstruction.consistency.agreement import contradiction_of
 
 CASES = (
     (360, (128, 128), 1.17, fx.Grid((96, 96, 96), 0.6)),
     (360, (380, 478), 0.2992, fx.Grid((256, 256, 256), 0.3)),
+    (144, (96, 96), 1.56, fx.Grid((96, 96, 96), 0.6)),
     (720, (760, 956), 0.1496, fx.Grid((400, 400, 400), 0.2)),
 )
 SOD, SDD = 600.0, 1059.0
@@ -35,9 +40,29 @@ def image_of(radius: float, shape: tuple[int, int], pixel: float) -> Float32Arra
     return np.asarray(0.02 * chord * np.sqrt(1.0 + up**2 / (SDD**2 + beside**2)), np.float32)
 
 
+def comparison_times(
+    image: Float32Array, scan: fx.ConeVec, shape: tuple[int, int]
+) -> tuple[str, str]:
+    """Processor seconds of a comparison: of images that fit, and of ones on a panel moved aside."""
+    pixel = float(np.linalg.norm(scan.u[0]))
+    aside = fx.ConeVec.circular(
+        sod=SOD, sdd=SDD, angles=len(scan), shape=shape, pixel=pixel, offset=(5.0 * pixel, 0.0)
+    )
+    found = []
+    for geometry in (scan, aside):
+        coarse = CoarseScan.of(lambda number: image, geometry, shape, None)
+        times = []
+        for _ in range(3):
+            begun = time.process_time()
+            contradiction_of(coarse)
+            times.append(time.process_time() - begun)
+        found.append(f"{min(times):.3f}")
+    return found[0], found[1]
+
+
 if __name__ == "__main__":
     warnings.simplefilter("ignore")
-    for views, shape, pixel, grid in CASES:
+    for views, shape, pixel, grid in CASES[: int(sys.argv[1]) if sys.argv[1:] else None]:
         scan = fx.ConeVec.circular(sod=SOD, sdd=SDD, angles=views, shape=shape, pixel=pixel)
         for what, radius in (("seen whole", 30.0), ("cut off", 55.0)):
             image = image_of(radius, shape, pixel)
@@ -55,4 +80,5 @@ if __name__ == "__main__":
                 )  # fmt: skip
                 best[turn % 2] = min(best[turn % 2], time.process_time() - begun)
             print(f"{views} views of {shape} into {grid.shape}, {what}: {best[0]:.2f} and "
-                  f"{best[1]:.2f} s, {best[1] / best[0]:.3f}", flush=True)  # fmt: skip
+                  f"{best[1]:.2f} s, {best[1] / best[0]:.3f}; comparison "
+                  f"{', '.join(comparison_times(image, scan, shape))} s", flush=True)  # fmt: skip

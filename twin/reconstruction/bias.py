@@ -150,7 +150,7 @@ def _bias_of(scan: CoarseScan) -> Bias:
     # Half of what is about them, and a quarter of what is usual: more than streaks in the air.
     inside = (sharp > 0.5 * found) & (np.minimum(sharp, found) > 0.25 * typical) & ~unseen
     causes: dict[str, FloatArray] = {}
-    contradiction = contradiction_of(scan, data)
+    contradiction = contradiction_of(scan)
     if contradiction is not None:
         return Bias(scan.grid.like(found), even, inside, causes, contradiction)
 

@@ -39,6 +39,10 @@ FEWEST: Final = 4.0
 """Columns on either side of the axis, where the panel has so many: a narrow overlap stays one."""
 VIEWS: Final = 180
 """Views, at most: enough for so many nodes and a panel moved aside."""
+COMPARED_VIEWS: Final = 2.0
+"""Views for a column, about, of a scan whose images are compared with its volume."""
+COMPARED_ROWS: Final = 8
+"""Rows of the same, at least, where the panel has so many."""
 AWAY: Final = 50.0
 """Distance of a source whose rays are parallel, over the radius of the scan."""
 
@@ -116,6 +120,33 @@ class CoarseScan:
         binned = (down, across)
         return cls(images, scan, circle, circle.angle[numbers], truncation, numbers, binned)
 
+    def thinned(self, *, all_views: bool = False) -> CoarseScan:
+        """Take fewer views and rows of a circle: enough to compare images with what a volume of
+        them gives when it is projected again.
+
+        Args:
+            all_views: take fewer rows alone.
+        """
+        count, rows, cols = self.images.shape
+        each = 1 if all_views else max(1, round(count / (COMPARED_VIEWS * cols)))
+        down = max(1, rows // COMPARED_ROWS)
+        rows -= rows % down
+        chosen = slice(None, None, each)
+        part = window(self.cone_vec[chosen], self.images.shape[1:], (0, rows), (0, cols))
+        views = ConeVec.from_vectors(part.source, part.detector, part.u, part.v * down)
+        truncation = self.truncation
+        if truncation is not None:
+            truncation = replace(truncation, rows=(truncation.rows + 0.5) / down - 0.5)
+        return replace(
+            self,
+            images=np.ascontiguousarray(binned_mean(self.images[chosen, :rows], (down, 1))),
+            cone_vec=views,
+            angles=self.angles[chosen],
+            truncation=truncation,
+            numbers=self.numbers[chosen],
+            binned=(self.binned[0] * down, self.binned[1]),
+        )
+
     @cached_property
     def level(self) -> ConeVec:
         """The same views with upright panels."""
@@ -192,12 +223,20 @@ class CoarseScan:
         return np.nan_to_num(self.fdk(images, rung.cone_vec, truncation))
 
     def projected(
-        self, thing: Float32Array, views: ConeVec, shape: tuple[int, int]
+        self, thing: Float32Array, views: ConeVec, shape: tuple[int, int], *, fine: bool = True
     ) -> Float32Array:
-        """Values on the grid, (nz, ny, nx), as some views see them, (n, rows, cols)."""
+        """Project values on the grid, (nz, ny, nx), as some views see them, (n, rows, cols).
+
+        Args:
+            thing: the values.
+            views: n of them.
+            shape: (rows, cols).
+            fine: two rays a column: the steps of voxels would show as a flaw of their own.
+        """
         higher = np.pad(thing, ((self.more, self.more), (0, 0), (0, 0)), "edge")
         volume = Volume(higher, self.grid.voxel_mm, self.grid.center_mm)
-        # Two rays a column: the steps of voxels would show as a flaw of their own.
+        if not fine:
+            return forward(volume, views, shape)
         finer = ConeVec.from_vectors(views.source, views.detector, 0.5 * views.u, views.v)
         rays = forward(volume, finer, (shape[0], 2 * shape[1]))
         return np.asarray(0.5 * (rays[:, :, ::2] + rays[:, :, 1::2]), np.float32)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -16,6 +17,8 @@ MEDIAN_OF_SQUARES = 0.4549
 """Median of the squares of normal deviates."""
 MORE_NOISE = 1.5
 """Variance of noise over what its median says: few photons give more large deviations."""
+NOISE_OF_CHANGES = np.array([1.0, 0.25])
+"""Variance of white noise in the values, and in their changes, over that in the values."""
 LEAST_SIGNAL = 0.3
 """Part of a residual that is kept whatever the noise, so that of two in much noise none is far
 better than the other."""
@@ -40,7 +43,6 @@ class Reprojection:
         images: Float32Array,
         cone_vec: ConeVec,
         truncation: Truncation | None,
-        values: Float32Array | None = None,
     ) -> Reprojection | None:
         """Reconstruct images as of a geometry, and project the volume.
 
@@ -49,18 +51,16 @@ class Reprojection:
             images: (n, rows, cols).
             cone_vec: n views.
             truncation: what lies beyond their edges.
-            values: of the volume, where they are known, (nz, ny, nx).
 
         Returns:
             None where FDK cannot use the geometry.
         """
-        if values is None:
-            try:
-                values = np.nan_to_num(scan.fdk(images, cone_vec, truncation))
-            except GeometryError:
-                return None
+        try:
+            values = np.nan_to_num(scan.fdk(images, cone_vec, truncation))
+        except GeometryError:
+            return None
         shape = (images.shape[1], images.shape[2])
-        return cls(images, scan.projected(values, cone_vec, shape))
+        return cls(images, scan.projected(values, cone_vec, shape, fine=False))
 
     def misfit(self, least: float = LEAST_SIGNAL) -> FloatArray:
         """Root mean square of the residual over that of the images, beside the noise: of the
@@ -70,26 +70,29 @@ class Reprojection:
         Args:
             least: part of the residual that is kept whatever the noise.
         """
+        residual, signal, noise = self._powers
+        beside = np.maximum(residual - noise, least * residual)
+        return np.asarray(np.sqrt(beside / np.maximum(signal, np.finfo(np.float32).tiny)))
+
+    @cached_property
+    def _powers(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Mean squares of residual, images and noise: of the values, and of their changes, (2,)."""
         rest = self.again - self.images
         # What differs between neighbours in both is the object's.
         noise = MORE_NOISE * max(_noise_of(self.images) - _noise_of(self.again), 0.0)
-        found = []
-        for filtered, share in ((_values, 1.0), (_changes, 0.25)):
-            residual = float(np.square(filtered(rest)).mean())
-            signal = float(np.square(filtered(self.images)).mean())
-            beside = max(residual - share * noise, least * residual)
-            found.append(np.sqrt(beside / max(signal, float(np.finfo(np.float32).tiny))))
-        return np.asarray(found)
+        residual, signal = (
+            np.array([_mean_square(what), _mean_square(_changes(what))])
+            for what in (rest, self.images)
+        )
+        return residual, signal, noise * NOISE_OF_CHANGES
 
 
-def _values(images: Float32Array) -> Float32Array:
-    return images
+def _mean_square(values: Float32Array) -> float:
+    return float(np.square(values).mean())
 
 
 def _changes(images: Float32Array) -> Float32Array:
-    """Changes between neighbouring columns of smoothed rows; their variance is a quarter of that of
-    white noise.
-    """
+    """Changes between neighbouring columns of smoothed rows."""
     smooth = 0.25 * images[..., :-2] + 0.5 * images[..., 1:-1] + 0.25 * images[..., 2:]
     return np.diff(smooth, axis=-1)
 
