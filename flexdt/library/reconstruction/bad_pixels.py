@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Final
@@ -17,6 +18,8 @@ from flexdt.twin.reconstruction.consistency.pixels import BadPixels, bad_pixels
 
 FEWEST: Final = 12
 """Views of an object that turns, in which it is seen what stands still."""
+MOST_KEPT_BYTES: Final = 128 << 20
+"""Line integrals that are kept between the passes over them; larger ones are made anew."""
 LEAST_TURN: Final = 0.2
 """Spread of the sources over their distance from the axis, at least, of a scan that turns."""
 
@@ -57,10 +60,17 @@ def _bad_pixels(
     if not np.isfinite(axis_column):
         return None
 
+    kept: list[Float32Array] = []
+    keeps = 4 * len(some) * math.prod(dataset.shape) <= MOST_KEPT_BYTES
+
     def images() -> Iterator[Float32Array]:
-        for index in some.tolist():
-            image = dataset.normalisation(counts(index))
-            yield image.T if lies else image
+        yield from kept
+        for index in some[len(kept) :].tolist():
+            made = dataset.normalisation(counts(index))
+            image = made.T if lies else made
+            if keeps:
+                kept.append(image)
+            yield image
 
     found = bad_pixels(images, axis_column)
     return BadPixels(found.mask.T) if found is not None and lies else found
