@@ -55,8 +55,9 @@ class Accuracy:
     """What the uniform regions of an object may be off by, noise not included.
 
     Attributes:
-        half: of the attenuation there, in half of them at most.
-        most: in nine of ten at most: the figure by which volumes are compared.
+        half: of the attenuation there, in half of them at most: the figure by which volumes are
+            compared.
+        most: in nine of ten at most.
         cause: what contributes most to the others: angles, aside, cone, rows, beyond or drift.
         cut_off: the object goes on beyond the panel's sides: the figures are estimates, no bounds.
     """

@@ -41,7 +41,7 @@ VIEWS: Final = 180
 """Views, at most: enough for so many nodes and a panel moved aside."""
 COMPARED_VIEWS: Final = 2.0
 """Views for a column, about, of a scan whose images are compared with its volume."""
-COMPARED_ROWS: Final = 8
+COMPARED_ROWS: Final = 16
 """Rows of the same, at least, where the panel has so many."""
 AWAY: Final = 50.0
 """Distance of a source whose rays are parallel, over the radius of the scan."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import accuracy_rank
 import bias_bound
 import numpy as np
 import pytest
+from scipy.stats import spearmanr
 
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
@@ -213,3 +215,15 @@ def test_what_no_image_shows_is_said_with_the_figures() -> None:
     assert "denser shell out there makes every value too low" in str(accuracy)
     scan, images = turned(upright(17.0, 0.02))
     assert "shell" not in str(fdk(images, scan, Grid((3, 30, 30), 1.0)).accuracy)
+
+
+@pytest.mark.slow
+def test_the_stated_accuracy_holds_and_ranks_scans() -> None:
+    """Drawn scans that chose no constant."""
+    found = [one for k in range(30) if (one := accuracy_rank.judged(8877, k)) is not None]
+    stated, true = (
+        np.array([getattr(one, name)[0] for one in found]) for name in ("stated", "true")
+    )
+    assert len(found) > 10
+    assert np.mean(true <= stated) > 0.9
+    assert spearmanr(stated, true)[0] > 0.4

@@ -155,7 +155,7 @@ class _Pattern:
             shared = np.maximum(_block_mean(left * other), np.float32(0.0))
             other_power = np.maximum(_block_mean(np.square(other)), np.finfo(np.float32).tiny)
             of_pixels = of_pixels - np.maximum(shared, shared**2 / other_power)
-            left = left - shared / other_power * other
+            left = np.subtract(left, shared / other_power * other, dtype=np.float32)
         power = np.maximum(_block_mean(np.square(left)), np.finfo(np.float32).tiny)
         gain = np.where(of_pixels > least, of_pixels - self.noise, np.float32(0.0))
         return np.asarray(np.minimum(gain / power, 1.0) * left, np.float32)
