@@ -116,7 +116,7 @@ def best_dip(cost: FloatArray, apart: float) -> tuple[int, float]:
 
 def find_symmetry(
     turn: Turn, view: View, start: FloatArray, scales: FloatArray, priors: FloatArray,
-    border: int | None = None,
+    border: int | None = None, held_px: float | None = None,
 ) -> Symmetry:  # fmt: skip
     """The plane of symmetry, coarse to fine.
 
@@ -127,6 +127,7 @@ def find_symmetry(
         scales: change of each parameter that moves the image's ends by about a pixel, (k,).
         priors: sigma of each parameter about its start, inf for none, (k,).
         border: first column beyond a gap between two tiles, whose width is the last parameter [px].
+        held_px: that width, where it is no parameter [px].
 
     Returns:
         The estimate of the level that tells the first two parameters best.
@@ -135,7 +136,8 @@ def find_symmetry(
     values = start
     for level in LEVELS:
         smoothing = max(turn.mean.shape[1] / level, 1.0)
-        found.append(_Level(turn, view, scales, start, priors, smoothing, border).solve(values))
+        one = _Level(turn, view, scales, start, priors, smoothing, border, held_px)
+        found.append(one.solve(values))
         if not found[-1].converged and border is None:
             break
         values = found[-1].values
@@ -148,9 +150,10 @@ class _Level:
 
     def __init__(
         self, turn: Turn, view: View, scales: FloatArray, mean: FloatArray, priors: FloatArray,
-        sigma: float, border: int | None,
+        sigma: float, border: int | None, held_px: float | None,
     ) -> None:  # fmt: skip
         self.view, self.scales, self.sigma, self.border = view, scales, sigma, border
+        self.held_px = held_px
         self.start, self.priors = mean, priors
         rows, cols = self.shape = turn.mean.shape
         images = [gaussian_filter(i, sigma, mode="nearest") for i in (turn.mean, *turn.doubts)]
@@ -208,7 +211,11 @@ class _Level:
         middle = (np.array(self.shape[::-1]) - 1)[:, None] / 2
         begins, gap = math.inf, 0.0
         if self.border is not None:
-            values, begins, gap = values[:-1], self.border - 0.5, float(values[-1])
+            begins = self.border - 0.5
+            if self.held_px is not None:
+                gap = self.held_px
+            else:
+                values, gap = values[:-1], float(values[-1])
         c, r, w = mirror_map(self.view(values)) @ np.vstack(
             [at[0] + gap * (at[0] > begins) - middle[0], at[1] - middle[1], np.ones(at.shape[1])]
         )

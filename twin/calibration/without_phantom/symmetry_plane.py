@@ -47,8 +47,6 @@ MOST_COLUMN: Final = 2.0
 """Largest sigma of the column that is offered [px]."""
 MOST_ROLL: Final = 0.5
 """Largest sigma of the roll that is offered [deg]."""
-HELD_PX: Final = 1e-3
-"""Standard deviation with which the width of a gap beside the axis is held in the fit [px]."""
 FLOOR_DEG: Final = 0.001
 """Added to the roll's sigma: what beam hardening and lag do to the mean (assumed) [deg]."""
 APART_SIGMAS: Final = 4.0
@@ -255,18 +253,22 @@ def _gap(scan: CircularScan, first: FirstColumn, panel: Panel | None) -> GapFoun
 
 def _closes(found: Symmetry, gap: Gap) -> bool:
     """Say whether the plane of symmetry tells the width, and leaves nothing of a gap."""
+    if gap.beside_axis:
+        return False
     sigma = float(np.sqrt(found.covariance[-1, -1]))
     told = sigma < gap.sigma / 2
     return found.converged and told and not found.values[-1] > SIGMAS * sigma
 
 
 def _with_gap(first: FirstColumn, gap: Gap) -> FirstColumn:
-    """Make the width of a gap the last parameter, held where the plane does not tell it."""
+    """Make the width of a gap the last parameter, where the plane tells it."""
+    if gap.beside_axis:
+        return replace(first, preface=f"{gap.text}; ")
     return replace(
         first,
         values=np.append(first.values, gap.width),
         scales=np.append(first.scales, 1.0),
-        priors=np.append(first.priors, HELD_PX if gap.beside_axis else gap.sigma),
+        priors=np.append(first.priors, gap.sigma),
         preface=f"{gap.text}; ",
     )
 
@@ -276,8 +278,11 @@ def _fit(scan: CircularScan, first: FirstColumn, gap: Gap | None) -> Symmetry:
     if first.turn is None:
         assert first.rays is not None
         return first.rays.find(first.values)
-    border = gap.column if gap else None
-    return find_symmetry(first.turn, scan.view, first.values, first.scales, first.priors, border)
+    return find_symmetry(
+        first.turn, scan.view, first.values, first.scales, first.priors,
+        border=gap.column if gap else None,
+        held_px=gap.width if gap and gap.beside_axis else None,
+    )  # fmt: skip
 
 
 def _require_symmetric(found: Symmetry, preface: str) -> None:
