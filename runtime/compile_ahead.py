@@ -80,12 +80,14 @@ def _fit() -> None:
 
 def _reconstruction() -> None:
     """Compile the kernels of FDK, on eight views."""
+    from flexdt.twin.projection.kernels import layout_kernels
     from flexdt.twin.reconstruction import fdk
     from flexdt.twin.reconstruction.kernels import fdk_kernels, truncation_kernels
 
     scan = ConeVec.circular(sod=10, sdd=20, angles=8, shape=(4, 6), pixel=1.0)
     images = np.ones((8, 4, 6), np.float32)
     fdk(images, scan, Grid((2, 3, 4), 0.5).blank())  # which go on beyond the panel's edges
+    layout_kernels.unfit_parts(images.reshape(-1).view(np.uint32))
     one = np.ones((1, 1))
     six = np.zeros(truncation_kernels.PARAMETERS)
     ray = np.ones((1, 1, 2))

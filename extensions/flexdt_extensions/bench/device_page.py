@@ -98,7 +98,7 @@ def run_device_bench(tell: Callable[[str], None]) -> Document:
             met = "wanted" if sign * value <= sign * wanted else "accepted"
         entry = {"target": what, "accepted": accepted, "wanted": wanted, "measured": value}
         if value is None:
-            entry["why"] = absent(ASTRA) or UNKNOWN_SPEED
+            entry["why"] = why_no_astra() or UNKNOWN_SPEED
         lines.append({**entry, "met": met})
         tell(row(lines[-1]))
 
@@ -226,8 +226,19 @@ def _quietly(call: Callable[[], object]) -> Callable[[], object]:
     return quiet
 
 
+def why_no_astra() -> str | None:
+    """Say why ASTRA cannot take part: not installed, or not to be loaded; None where it can."""
+    if missing := absent(ASTRA):
+        return missing
+    try:
+        import astra  # noqa: F401
+    except ImportError as error:
+        return f"{ASTRA} does not load: {error}"
+    return None
+
+
 def astra_ms(volume: Volume, scan: ConeVec, algorithm: str) -> float | None:
-    """ASTRA's time with its data on the device, or None where it is not installed."""
+    """ASTRA's time with its data on the device, or None where `why_no_astra` says why."""
     try:
         prepared = Resident(volume, scan, PANEL, algorithm)
     except ImportError:

@@ -18,6 +18,7 @@ from loaded_script import load
 from flexdt.clients.cli.command_tree import run as run_command
 from flexdt.twin.projection import forward, gpu
 from flexdt_extensions.bench import benchmark as run
+from flexdt_extensions.bench import device_page
 from flexdt_extensions.bench.benchmark import (
     Case,
     circle,
@@ -336,6 +337,16 @@ def test_the_page_of_a_device_has_every_target(tmp_path) -> None:
     assert re.search(
         r"not measured: (astra-toolbox is not installed|the device does not say)", text
     )
+
+
+@pytest.mark.parametrize("installed", [False, True])
+def test_the_page_of_a_device_says_why_astra_takes_no_part(monkeypatch, installed) -> None:
+    missing = "astra-toolbox is not installed"
+    monkeypatch.setattr(device_page, "absent", lambda name: None if installed else missing)
+    monkeypatch.setitem(sys.modules, "astra", None)  # as if a library of its did not load
+    why = device_page.why_no_astra()
+    assert why is not None
+    assert why.startswith("astra-toolbox does not load: " if installed else missing)
 
 
 def test_a_contestant_may_time_itself() -> None:
