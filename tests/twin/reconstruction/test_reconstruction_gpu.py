@@ -241,6 +241,58 @@ if sys.argv[2] == "tv":
 """
 
 
+FILTERED = """
+import sys
+import numpy as np
+from flexdt.twin.reconstruction.feldkamp.backprojection import bits_reversed
+from flexdt.twin.reconstruction.feldkamp.filtering import filtered, ramp, response_of_length
+from flexdt.twin.reconstruction.kernels import gpu_reconstruction_kernels as kernels
+from tests.support.device_simulator import as_on_a_device
+
+as_on_a_device()
+kernels.THREADS = 8
+rng = np.random.default_rng(int(sys.argv[1]))
+n, rows, wide = 2, int(rng.integers(1, 5)), int(rng.integers(2, 40))
+start, stop = sorted(rng.choice(wide + 1, 2, replace=False).tolist())
+pitch, reach = rng.uniform(0.05, 2.0), max(wide - start, stop)
+images = rng.standard_normal((n, rows, wide)).astype(np.float32)
+factors, across = rng.random((2, n, wide), dtype=np.float32) + 1
+up = rng.random((n, rows), dtype=np.float32)
+response = ramp(reach, pitch)
+
+# The ramp filter in space (Kak and Slaney 1988, chapter 3), a sum for each pixel, in double.
+apart = np.abs(np.arange(start, stop)[:, None] - np.arange(wide))
+odd = apart % 2 == 1
+taps = np.where(odd, -1.0 / (np.pi * np.where(odd, apart, 1) * pitch) ** 2, 0.0)
+taps[apart == 0] = 0.25 / pitch**2
+lines = images * (factors[:, None] / np.sqrt(across[:, None].astype(float) + up[:, :, None]))
+wanted = pitch * lines @ taps.T
+
+least = max(2 * reach - 1, wide, 2)
+length = 1 << (least - 1).bit_length() + int(rng.integers(2))
+short = response_of_length(response, length) / length
+there = np.concatenate([short, short[-2:0:-1]])[bits_reversed(length)].astype(np.float32)
+turn = 2 * np.pi * np.arange(length // 2) / length
+found = np.full((n, stop - start, rows), np.nan, np.float32)
+whole = np.zeros(rows, np.float32)
+none = np.zeros((n, 1, wide), np.float32), np.zeros(rows, np.int32), whole, whole
+kernels.filter_rows[(-(-rows // 2), n), kernels.THREADS](
+    images, 0, 0, 0, factors, across, up, *none, np.zeros(wide, np.float32), there,
+    np.cos(turn).astype(np.float32), np.sin(turn).astype(np.float32), start, found,
+)
+most = 2e-6 * np.abs(wanted).max()
+assert np.abs(found.transpose(0, 2, 1) - wanted).max() < most
+here = filtered(lines.astype(np.float32), response)[..., start:stop]
+assert np.abs(here - wanted).max() < most
+"""
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.daily(1)
+def test_both_devices_filter_as_the_ramp_in_space(seed) -> None:
+    run_simulated(FILTERED, str(seed))
+
+
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.daily(1)
 @pytest.mark.campaign(1)
