@@ -191,7 +191,7 @@ def of_scan(said: dict[str, Any], wire: Wire) -> list[str]:
         off = "X-rays are off" in texts["job-what"]
         if off == wire.state.tube.on:
             found.append(f"scan: {texts['job-what']}, and X-rays: {wire.state.tube.on}")
-        for motor, value in re.findall(r"(\w+) at (-?[\d.]+)", texts["job-what"]):
+        for motor, value in re.findall(r"(?!began)\b(\w+) at (-?[\d.]+)", texts["job-what"]):
             if abs(wire.state.axes[motor].position - float(value)) > 0.02:
                 found.append(f"scan: {motor} at {value}")
     if shown["job-abort"] != (job.state in UNENDED) or shown["job-resume"] != (job.state != "done"):
@@ -238,6 +238,8 @@ def of_old_picture(page: Any, before: tuple[object, object], state: State) -> li
     picture = said["picture"]
     if picture is None or picture["recorded"] is not None or before == now:
         return []
+    if state.sample.name is None and all(value == 0.0 for *_, value in picture["places"]):
+        return []  # an empty stage is computed without a projector
     tag = said["texts"]["film-old"] if said["shown"]["film-old"] else ""
     if not tag or (before[0] != now[0]) != ("sample" in tag):
         return [f"the radiograph is of {before[0]}, now is {now[0]}, and it is called {tag!r}"]

@@ -2,7 +2,7 @@
 changes of sample, tube, camera and correction.
 
 `CAMPAIGNS=tests/viewer/test_page_statements.py make campaigns` runs 500 histories; `make page`
-runs two.
+runs one, and the rare moments.
 """
 
 from __future__ import annotations
@@ -213,7 +213,7 @@ def small(lab: Lab, twin: TwinClient) -> Iterator[None]:
 
 
 @pytest.mark.slow
-@pytest.mark.campaign(2)
+@pytest.mark.campaign(1)
 @pytest.mark.parametrize("seed", range(SEEDS))
 def test_no_statement_of_the_page_contradicts_the_wire(
     page: Any, lab: Lab, small: None, seed: int
@@ -225,3 +225,25 @@ def test_no_statement_of_the_page_contradicts_the_wire(
         history.agree()
     page.evaluate("flexdt.data.open(null)")
     page.fill("#script", "")
+
+
+@pytest.mark.slow
+def test_an_abort_of_somebody_else_and_a_hung_projector(
+    page: Any, lab: Lab, small: None, twin: TwinClient
+) -> None:
+    history = History(lab, page, 1)
+    with history.other() as bert:
+        bert.control("force")
+        bert.submit_script(fly_script(frames=600), None, 1.0)
+        until(lambda: bert.job_status().frames_done > 0, "a first image")
+        bert.abort_job()
+        until(lambda: not running(bert), "its end")
+    history.agree()
+    assert "Bert" in page.inner_text("#job-state")
+    assert page.locator("#job-back").is_visible()
+    page.click("#job-back")
+    history.agree()
+    assert not page.locator("#job-back").is_visible()
+    assert "everything stands where it began" in page.inner_text("#job-what")
+    history.hang_projector()
+    history.agree()

@@ -246,7 +246,7 @@ function show(state) {
     const s = state.sample;
     for (const k of SIX)
         put(`off-${k}`, s.offset[k], 4);
-    put("sample", s.name);
+    put("sample", s.name ?? "empty");
     $("#sample-note").textContent = s.size_mm
         ? s.size_mm.map((v) => fixed(v, 1)).join(" × ") + " mm"
         : "";

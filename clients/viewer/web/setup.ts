@@ -288,7 +288,7 @@ function show(state: State) {
     `${c.shape[1]} × ${c.shape[0]} px, ${fixed(c.pixel_mm * 1000, 1)} µm`;
   const s = state.sample;
   for (const k of SIX) put(`off-${k}`, s.offset[k], 4);
-  put("sample", s.name);
+  put("sample", s.name ?? "empty");
   $("#sample-note").textContent = s.size_mm
     ? s.size_mm.map((v) => fixed(v, 1)).join(" × ") + " mm"
     : "";
