@@ -17,6 +17,7 @@ from typing import Any, Final, Literal
 import numpy as np
 import viser
 
+from flexdt.clients.viewer.page_html import TRANSLUCENT, page_file
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
 from flexdt.clients.viewer.scenes.layers import Nodes
 from flexdt.clients.viewer.scenes.sample_looks import SampleLook
@@ -91,7 +92,8 @@ def _file(serializer: Any, form: Form, dark: bool, title: str, beside: str = "")
     if form != "html":
         return bytes(serializer.serialize())
     page = re.sub(r"<title>.*?</title>", "", str(serializer.as_html(dark_mode=dark)), count=1)
-    head = f"<head><title>{html.escape(title)}</title>"
+    first = page_file(TRANSLUCENT).decode()
+    head = f"<head><title>{html.escape(title)}</title><script>{first}</script>"
     return page.replace("<head>", head, 1).replace("</body>", f"{beside}</body>", 1).encode()
 
 

@@ -32,7 +32,7 @@ from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
 from flexdt.clients.viewer.browser_connections import Admission, BrowserConnection
-from flexdt.clients.viewer.page_html import PAGE, page_file
+from flexdt.clients.viewer.page_html import PAGE, TRANSLUCENT, page_file
 from flexdt.clients.viewer.page_messages import MessageFilter
 from flexdt.clients.viewer.viser_gate import MARK, parted
 from flexdt.runtime.access import check_bind, is_loopback, is_rebound, token_matches
@@ -110,8 +110,9 @@ class Front:
         self._guessing, self._closing = asyncio.Lock(), asyncio.Event()
         self.wrong_tokens = 0
         self._downloads, self._token, self._still = downloads, token, still
-        more = b"<style>%s</style><script>%s</script>" % (
+        more = b"<style>%s</style><script>%s</script><script>%s</script>" % (
             page_file("scene.css"),
+            page_file(TRANSLUCENT),
             page_file("scene.js"),
         )
         bare, self._program = parted(scene_html)

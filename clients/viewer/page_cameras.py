@@ -6,6 +6,7 @@ But for the beam's eye, a view belongs to its user; only the page's buttons move
 
 from __future__ import annotations
 
+import contextlib
 import math
 import threading
 from collections.abc import Callable
@@ -17,13 +18,15 @@ import viser
 from flexdt.clients.viewer.front import SCENE_PATH
 from flexdt.clients.viewer.scenes.lamps import SKY, light_finely
 from flexdt.clients.viewer.scenes.layers import Nodes
-from flexdt.clients.viewer.scenes.views import Standpoint, roomy
+from flexdt.clients.viewer.scenes.views import Fitted, Standpoint
 from flexdt.clients.viewer.scenes.world import MM
 from flexdt.clients.viewer.viser_gate import Scenes, set_nodes
 from flexdt.twin.geometry.conventions import FloatArray
 
 FILLS = 1.3
 """Of the distance at which a ball that is looked at fills the picture."""
+TOUCHED = 0.005
+"""Part of its distance by which a camera stands elsewhere once a person has moved it."""
 
 
 @dataclass(frozen=True)
@@ -46,11 +49,14 @@ class SceneClients:
         self._lock = threading.Lock()
         self._who: dict[int, Who] = {}
         self._sent: dict[int, Standpoint] = {}
+        """Client -> where its camera was put last; a person may have moved it since."""
         self._theme: dict[str, tuple[bool, bool]] = {}
         """Page -> whether its frames are dark, and finely lit."""
         self._shown: dict[int, tuple[int, Nodes]] = {}
         """Client -> what was built when, and how its nodes stand."""
-        self.cameras: dict[str, Standpoint] = {}
+        self._beam: Standpoint | None = None
+        self.cameras: dict[str, Fitted] = {}
+        """View -> what it holds; the beam's eye, which follows the machine, has none."""
         self.joined: Callable[[viser.ClientHandle, str], None] = lambda client, page: None
         """Called in one of viser's threads with a new frame and its page."""
         self._server.on_client_connect(self._connected)
@@ -94,26 +100,37 @@ class SceneClients:
             who = None if client_id is None else self._who.get(client_id)
         return None if who is None else who.page
 
-    def follow(self, view: str, camera: Standpoint) -> None:
-        """Move every client of `view` to `camera`, now and when they connect."""
-        self.cameras[view] = camera
-        with self._lock:
-            ids = [i for i, w in self._who.items() if w.view == view]
-        for i in ids:
-            self._aim(i, camera)
+    def follow(self, camera: Standpoint) -> None:
+        """Move every beam's eye to `camera`, now and when one connects."""
+        self._beam = camera
+        for client in self._looking("beam"):
+            self._put(client, camera)
+
+    def fit(self, anew: bool = False) -> None:
+        """Have each view hold what it should, unless a person has moved its camera.
+
+        Args:
+            anew: put all cameras to their presets, moved or not.
+        """
+        for view, preset in self.cameras.items():
+            for client in self._looking(view):
+                with contextlib.suppress(AssertionError):  # it has not said yet how wide it is
+                    aspect = client.camera.aspect
+                    if anew or (self._untouched(client) and not preset.fits(_now(client), aspect)):
+                        self._put(client, preset.at(aspect))
 
     def reset(self, page: str, view: str) -> None:
         """Put a page's view back to its preset."""
-        camera = self.cameras.get(view)
+        preset = self.cameras.get(view)
         for client in self.of(page, view):
-            if camera is not None:
-                aim(client, roomy(camera, client.camera.aspect))
+            if preset is not None:
+                self._put(client, preset.at(client.camera.aspect))
 
     def look(self, page: str, view: str, at: FloatArray, radius_mm: float) -> None:
         """Have a page's view look at a ball, (3,) [mm], from where it looks."""
-        preset = self.cameras[view]
         for client in self.of(page, view):
             aspect = client.camera.aspect
+            preset = self.cameras[view].at(aspect)
             far = FILLS * radius_mm * MM / math.sin(preset.fov / 2) / min(1.0, max(aspect, 0.3))
             way = np.subtract(preset.position, preset.look_at)
             middle = at * MM
@@ -130,14 +147,28 @@ class SceneClients:
         """Drop the clients of a page that has closed."""
         self._theme.pop(page, None)
 
-    def _aim(self, id: int, camera: Standpoint) -> None:
-        if self._sent.get(id) == camera:
+    def _looking(self, view: str) -> list[viser.ClientHandle]:
+        """Clients that show a view, of any page."""
+        with self._lock:
+            ids = [i for i, w in self._who.items() if w.view == view]
+        clients = self._server.get_clients()
+        return [clients[i] for i in ids if i in clients]
+
+    def _put(self, client: viser.ClientHandle, camera: Standpoint) -> None:
+        """Set a client's camera, unless it was put there last."""
+        if self._sent.get(client.client_id) == camera and self._untouched(client):
             return
-        client = self._server.get_clients().get(id)
-        if client is not None:
-            self._sent[id] = camera
-            beam = self._who.get(id) is not None and self._who[id].view == "beam"
-            aim(client, camera if beam else roomy(camera, client.camera.aspect))
+        self._sent[client.client_id] = camera
+        aim(client, camera)
+
+    def _untouched(self, client: viser.ClientHandle) -> bool:
+        """Whether a client's camera still stands where it was put."""
+        put = self._sent.get(client.client_id)
+        if put is None:
+            return False
+        reach_m = math.dist(put.position, put.look_at)
+        apart_m = math.dist(put.position, tuple(client.camera.position))
+        return apart_m < TOUCHED * reach_m
 
     def _connected(self, client: viser.ClientHandle) -> None:
         path = self._scenes.path_of(client.client_id)
@@ -147,8 +178,10 @@ class SceneClients:
         who = Who(match[1], match[2])
         with self._lock:
             self._who[client.client_id] = who
-        if who.view in self.cameras:
-            self._aim(client.client_id, self.cameras[who.view])
+        if who.view == "beam" and self._beam is not None:
+            self._put(client, self._beam)
+        elif who.view in self.cameras:
+            self._put(client, self.cameras[who.view].at(client.camera.aspect))
         _theme(client, *self._theme.get(who.page, (False, False)))
         self.joined(client, who.page)
 
@@ -157,6 +190,15 @@ class SceneClients:
             self._who.pop(client.client_id, None)
             self._sent.pop(client.client_id, None)
             self._shown.pop(client.client_id, None)
+
+
+def _now(client: viser.ClientHandle) -> Standpoint:
+    """Where a client looks from."""
+    c = client.camera
+    position, look_at, up = (
+        (float(v[0]), float(v[1]), float(v[2])) for v in (c.position, c.look_at, c.up_direction)
+    )
+    return Standpoint(position, look_at, up, float(c.fov))
 
 
 def aim(client: viser.ClientHandle, camera: Standpoint) -> None:

@@ -9,6 +9,8 @@ from typing import Final
 from flexdt.clients.viewer.scenes.layers import LAYERS, Layer
 
 PAGE: Final = "index.html"
+TRANSLUCENT: Final = "translucent.js"
+"""What every scene of viser loads first, on the page and exported."""
 PLACE: Final = "<!-- a box for each layer -->"
 """Where the boxes stand."""
 

@@ -16,7 +16,7 @@ import json
 import secrets
 import time
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -103,6 +103,13 @@ class Camera(Params):
 
     view: View = "free"
     sample: bool = False
+
+
+class Preset(Params):
+    """A view and its pane's width over its height."""
+
+    view: View = "free"
+    aspect: Annotated[float, Ge(0.05), Le(20)] = 1.0
 
 
 class Ray(Params):
@@ -251,6 +258,12 @@ async def camera(viewer: Viewer, page: Page, params: Camera) -> object:
     else:
         viewer.clients.reset(page.id, params.view)
     return {}
+
+
+async def preset(viewer: Viewer, page: Page, params: Preset) -> object:
+    """Say where the camera of a view opens in a pane of this page; empty where nobody knows."""
+    fitted = viewer.clients.cameras.get(params.view)
+    return {} if fitted is None else asdict(fitted.at(params.aspect))
 
 
 async def feed(viewer: Viewer, page: Page, params: Feed) -> object:
@@ -607,6 +620,7 @@ METHODS: Mapping[str, tuple[type[Params], Answer]] = {
     "viewer.layers": (layers_model(), layers),
     "viewer.theme": (Theme, theme),
     "viewer.camera": (Camera, camera),
+    "viewer.preset": (Preset, preset),
     "viewer.feed": (Feed, feed),
     "viewer.window": (Window, window),
     "viewer.ray": (Ray, ray),

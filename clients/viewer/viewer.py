@@ -13,12 +13,12 @@ import json
 import logging
 import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import parse_qs, urlsplit
 
+import numpy as np
 import viser
 from websockets.asyncio.server import ServerConnection
 
@@ -235,11 +235,18 @@ class Viewer:
             await asyncio.sleep(BEAT_S)
 
     async def _name(self) -> None:
-        """Keep names where they have room in each view, whatever moves: cameras do it unasked."""
+        """Keep names where they have room in each view, whatever moves: cameras do it unasked.
+
+        What has come to rest is in each picture, too, unless a person has chosen another one.
+        """
+        before: World | None = None
         while True:
             await asyncio.sleep(NAMES_S)
             lab, world = self.lab, self.world
             if lab is not None and world is not None:
+                if before is not None and np.allclose(before.view.rows, world.view.rows):
+                    self.clients.fit()
+                before = world
                 self.show_layers()
                 for client, id in self.clients.with_names():
                     named = lab.named(world, self._shown_by(id))
@@ -271,7 +278,7 @@ class Viewer:
             connected=self.link.connected,
             problem=self.link.problem,
             twin=str(self.twin_address),
-            cameras={name: asdict(camera) for name, camera in self.clients.cameras.items()},
+            drawn=bool(self.clients.cameras),
             hello=hello and hello.model_dump(),
         )
 
@@ -307,12 +314,12 @@ class Viewer:
         self.state, self.world = state, world
         if sample_changed:
             await self._dress(lab, state)
-        self.clients.cameras.update(views.presets(world, self.look.radius_mm))
+        rim_mm = views.rim(world, [skin.vertices for skin in self.look.skins])
+        self.clients.cameras = views.presets(world, self.look.radius_mm, rim_mm)
         if first:  # the picture of the scene shows an image, too
             self.feeds["line_integral"].start()
         if lab is not before:
-            for view, camera in self.clients.cameras.items():
-                self.clients.follow(view, camera)
+            self.clients.fit(anew=True)
             for page in self.pages.values():
                 self._tell_link(page)
         if first:  # images that came before could not be drawn
@@ -325,7 +332,7 @@ class Viewer:
             lab.draw_ranges(state)
         self._placed.set()
         camera, framing = views.beam_view(world)
-        self.clients.follow("beam", camera)
+        self.clients.follow(camera)
         text = json.dumps(
             {
                 "type": "state",
@@ -408,8 +415,11 @@ class Viewer:
         if lab is None or world is None or camera is None:
             return None
         shown = self._shown_by(asked.get("page", ""))
-        stamp = (self._pictured, id(self.look), shown, *world.view.rows.flat)
-        return await self._stills.picture(camera, asked, stamp, lambda: lab.shapes(world, shown))
+        near = asked.get("view") == "sample"
+        stamp = (self._pictured, id(self.look), shown, near, *world.view.rows.flat)
+        return await self._stills.picture(
+            camera, asked, stamp, lambda: lab.shapes(world, shown, near=near)
+        )
 
     def _grown(self, line: str) -> None:
         surface, slices = line.split("\t")

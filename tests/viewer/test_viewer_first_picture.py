@@ -17,9 +17,11 @@ from scipy.spatial import ConvexHull
 
 from flexdt.clients.client.client import TwinClient
 from flexdt.clients.viewer.scenes.meshes.cabinet import cabinet, room_of
+from flexdt.clients.viewer.scenes.sample_looks import MeshCache
 from flexdt.clients.viewer.scenes.still import Shape, drawn
-from flexdt.clients.viewer.scenes.views import ROOM, WIDE, Standpoint, fitted, presets, roomy
+from flexdt.clients.viewer.scenes.views import ROOM, WIDE, Standpoint, fitted, presets, rim
 from flexdt.clients.viewer.scenes.world import World, placed
+from flexdt.protocol.state_model import SampleState
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import builtin_machine, profile_of
 from tests.viewer.looking import changed, picture, until
@@ -54,16 +56,39 @@ def seen_at(points: Points, camera: Standpoint, aspect: float) -> Points:
 @pytest.mark.parametrize(
     "targets", [{}, {"mag_obj": 200.0}, {"mag_det": 700.0, "mag_obj": 300.0, "ver_tube": 200.0}]
 )
-def test_the_overview_holds_source_sample_and_image(
-    targets: dict[str, float], aspect: float
-) -> None:
+def test_views_hold_source_sample_and_image(targets: dict[str, float], aspect: float) -> None:
     world = world_at(**targets)
-    iso = roomy(presets(world, 45.0)["iso"], aspect)
+    views = presets(world, 45.0)
     middle, up = world.sample.shift, np.array([0.0, 0.0, 45.0])
     points = np.concatenate([[world.source, middle - up, middle + up], world.corners])
-    assert np.abs(seen_at(0.001 * points, iso, aspect)).max() <= ROOM + 1e-9
-    # The image on the panel is seen from its front.
-    assert (np.asarray(iso.position) - 0.001 * world.detector) @ world.normal < 0.0
+    for view in ("iso", "side", "free"):
+        camera = views[view].at(aspect)
+        assert views[view].fits(camera, aspect)
+        seen = np.abs(seen_at(0.001 * points, camera, aspect))
+        assert seen.max() <= ROOM + 1e-9
+        assert seen.max() > 0.75
+        # The image on the panel is seen from its front, or its edge.
+        assert (np.asarray(camera.position) - 0.001 * world.detector) @ world.normal < 0.05
+
+
+@pytest.mark.parametrize("name", ["lego", "wide", "small", "chiral"])
+@pytest.mark.parametrize("mag_obj", [150.0, 600.0, 1000.0])
+def test_the_sample_close_up_is_large_at_any_magnification_and_turn(
+    name: str, mag_obj: float
+) -> None:
+    """Its longer side takes at least two thirds of the picture, whose side is a third of the
+    pane's height: a fifth of the pane."""
+    skins = MeshCache().look(SampleState(name=name)).skins
+    vertices = np.concatenate([skin.vertices for skin in skins]).astype(float)
+    for turn in (0.0, 31.0, 90.0):
+        world = world_at(mag_obj=mag_obj, rot_obj=turn)
+        rim_mm = rim(world, [skin.vertices for skin in skins])
+        camera = presets(world, 45.0, rim_mm)["sample"].at(1.0)
+        places = vertices @ world.sample.turn.T + 0.001 * world.sample.shift
+        seen = seen_at(places, camera, 1.0)
+        size = np.ptp(seen, axis=0) / 2.0
+        assert np.abs(seen).max() <= ROOM + 1e-9
+        assert size.max() >= 0.62
 
 
 def test_no_nearer_camera_holds_all_points() -> None:

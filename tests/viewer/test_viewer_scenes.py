@@ -17,7 +17,8 @@ from scipy.spatial import ConvexHull
 
 from flexdt.clients.client.client import TwinClient
 from flexdt.clients.viewer.scenes.drag_handles import SIZE_M
-from flexdt.clients.viewer.scenes.views import FIXED, Standpoint, presets, roomy
+from flexdt.clients.viewer.scenes.sample_looks import MeshCache
+from flexdt.clients.viewer.scenes.views import Standpoint, presets
 from flexdt.clients.viewer.scenes.world import world_of
 from flexdt.protocol.state_model import State
 from flexdt.twin.machine.description import builtin_machine, profile_of
@@ -177,11 +178,11 @@ def test_dragging_a_handle_moves_its_stage(
     frame = box.bounding_box()
     before = twin.state().axes[axis].position
     # An arrow begins at its stage's point. Side view: world y runs to the right, z up.
-    point = _handles(scene, twin)[stage]
+    point, camera = _handles(scene, twin)[stage], preset(scene, "side", frame)
     direction = np.array([0.0, 0.0, 1.0] if along == "z" else [0.0, 1.0, 0.0])
     sign = -1.0 if along == "y" else 1.0  # towards the source there is room
     for reach in 3 * (1.0, 0.95, 0.9, 0.85):  # the ring, 0.65 wide, lies before the arrow
-        here = _on_screen(frame, "side", point + SIZE_M * reach * direction)
+        here = _on_screen(frame, camera, point + SIZE_M * reach * direction)
         scene.mouse.move(*here)
         if held(box):
             break
@@ -205,12 +206,13 @@ def test_dragging_the_ring_turns_the_sample_with_the_pointer(
 ) -> None:
     box = with_handles(scene, twin, wait, "free")
     frame = box.bounding_box()
+    camera = preset(scene, "free", frame)
     before = twin.state().axes["rot_obj"].position
 
     def place(degrees: float, radius: float) -> tuple[float, float]:
         turn = math.radians(degrees)
         arm = SIZE_M * radius * np.array([math.cos(turn), math.sin(turn), 0.0])
-        return _on_screen(frame, "free", _handles(scene, twin)["object"] + arm)
+        return _on_screen(frame, camera, _handles(scene, twin)["object"] + arm)
 
     # The ring is an arc from the arrow along x to the one along y; 50 degrees clockwise on it.
     for radius in 3 * (0.65, 0.63, 0.67):
@@ -247,20 +249,21 @@ def _handles(scene: Any, twin: TwinClient) -> dict[str, npt.NDArray[np.float64]]
     return {stage: np.array([0.0, y, z]) * 0.001 for stage, (y, z) in along.items()}
 
 
-def overview(page: Any) -> Standpoint:
-    """The isometric view's preset with the block on the stage, from the state that a page shows."""
+def preset(page: Any, view: str, frame: dict[str, float]) -> Standpoint:
+    """A view's preset in a pane, from the state that the page shows."""
     machine = builtin_machine()
     state = State.model_validate(page.evaluate("flexdt.store.state"))
     world = world_of(machine, profile_of(machine), state)
-    return presets(world, 0.5 * float(np.linalg.norm(BLOCK_MM)))["iso"]
+    shipped = state.sample.revision is None
+    look_mm = MeshCache().look(state.sample).radius_mm if shipped else 0.0
+    radius_mm = look_mm if shipped else 0.5 * float(np.linalg.norm(BLOCK_MM))
+    return presets(world, radius_mm)[view].at(frame["width"] / frame["height"])
 
 
 def _on_screen(
-    frame: dict[str, float], preset: str | Standpoint, point: npt.NDArray[np.float64]
+    frame: dict[str, float], camera: Standpoint, point: npt.NDArray[np.float64]
 ) -> tuple[float, float]:
     """Where a point of the world [m] appears on the page, in a view that is at its preset."""
-    preset = FIXED[preset] if isinstance(preset, str) else preset
-    camera = roomy(preset, frame["width"] / frame["height"])
     eye = np.asarray(camera.position)
     ahead = np.asarray(camera.look_at) - eye
     ahead /= np.linalg.norm(ahead)
@@ -398,8 +401,8 @@ def off_outline(box: Any, layer: str, view: str, points: npt.NDArray[np.float64]
     The points are projected here, with the pinhole of the view's camera alone.
     """
     frame = {**box.bounding_box(), "x": 0.0, "y": 0.0}
-    preset = overview(box.page) if view == "iso" else FIXED[view]
-    corners = np.array([_on_screen(frame, preset, p) for p in points])
+    camera = preset(box.page, view, frame)
+    corners = np.array([_on_screen(frame, camera, p) for p in points])
     wanted = inside_hull(corners, int(frame["height"]), int(frame["width"]))
     assert 200 < wanted.sum() < 0.2 * wanted.size
     depth = np.where(wanted, distance_transform_edt(wanted), distance_transform_edt(~wanted))
@@ -499,8 +502,9 @@ def test_a_clicked_pixels_ray_is_drawn_and_says_what_it_goes_through(
             return found is not None and np.allclose([*map(float, found.groups())], wanted, 0, 0.06)
 
         wait(said, f"{inside} mm of abs at {column} {row}")
+    frame = {**box.bounding_box(), "x": 0.0, "y": 0.0}
     here, there = (
-        np.array(_on_screen({**box.bounding_box(), "x": 0.0, "y": 0.0}, overview(block), point))
+        np.array(_on_screen(frame, preset(block, "iso", frame), point))
         for point in (_handles(block, twin)["source"], place_of(twin, (column, row)))
     )
     shown = settled(box, lambda now: pink(now).sum() > PATH_PX)

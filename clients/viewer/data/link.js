@@ -28,7 +28,7 @@ export const store = {
     refused: null,
     problem: null,
     coneVec: null,
-    cameras: null,
+    drawn: false,
 };
 // Older than OLD_S, what is shown is said to be old; after SILENT_S nobody waits for answers any
 // more.
@@ -145,7 +145,7 @@ const handlers = {
             refused: null,
             twin: m.connected,
             problem: m.problem,
-            cameras: m.cameras,
+            drawn: m.drawn,
         });
         store.hello = m.hello ?? store.hello;
         if (store.state)

@@ -43,7 +43,7 @@ listen(window);
 connect();
 // The scenes' frames say which page they belong to, so the page has been registered before.
 on("connection", () => {
-    if (store.cameras?.iso && !$("#views").childElementCount)
+    if (store.drawn && !$("#views").childElementCount)
         layout(window.firstView);
 });
 window.flexdt = { store, call, scan, data, film, picture, value, volume };

@@ -3,7 +3,6 @@ import { $, $$, el } from "./dom.js";
 import { call, emit, on, pageId, store } from "./link.js";
 import { remember } from "./address.js";
 const NAMES = { iso: "Isometric", beam: "Beam’s eye", side: "Side", free: "Free" };
-const WIDE = 1.35; // aspect for which the cameras are made, as in scenes/world.py
 const open = new Map();
 $("#view-switch").append(...Object.entries({ four: "Four views", ...NAMES }).map(([name, words]) => el("button", { "data-layout": name, onclick: () => layout(name, true) }, words)));
 export let current = null;
@@ -22,14 +21,21 @@ export const fine = query.has("light") ? query.get("light") === "fine" : !softwa
 const GAP_MS = Number(query.get("gap") ?? (software ? 400 : 0));
 const DPR = query.get("dpr") ?? (devicePixelRatio > 1.5 && !software ? "" : "1");
 // The preset from the start, so that nothing jumps when the viewer sets it again. The beam's eye has none: it moves
-// with the machine, and the camera that this page was told is the one of the moment in which it connected.
-function preset(view, box) {
-    const camera = store.cameras?.[view];
-    if (!camera || view === "beam")
+// with the machine.
+async function preset(view, box) {
+    if (view === "beam")
         return "";
-    const { position: p, look_at: l, fov } = camera, aspect = box.clientWidth / Math.max(1, box.clientHeight);
-    const wider = Math.max(1, WIDE / Math.max(aspect, 0.3));
-    return `initialCameraPosition=${p.join()}&initialCameraLookAt=${l.join()}&initialCameraFov=${2 * Math.atan(wider * Math.tan(fov / 2))}&`;
+    const aspect = Math.min(20, Math.max(0.05, box.clientWidth / Math.max(1, box.clientHeight)));
+    const camera = await call("viewer.preset", { view, aspect }).catch(() => null);
+    if (!camera?.position || !camera.look_at || !camera.fov)
+        return "";
+    const { position, look_at, fov } = camera;
+    return `initialCameraPosition=${position.join()}&initialCameraLookAt=${look_at.join()}&initialCameraFov=${fov}&`;
+}
+async function start({ box, iframe, src }, view) {
+    const found = await preset(view, box);
+    if (open.get(view)?.iframe === iframe && !iframe.src)
+        iframe.src = src.replace("?", `?${found}`);
 }
 function frame(view) {
     const src = `/scene/${pageId}/${view}?${DPR ? `fixedDpr=${DPR}&` : ""}gap=${GAP_MS}`;
@@ -46,18 +52,18 @@ function frame(view) {
     const home = el("button", { class: "home", title: "Back to this view's preset", onclick: () => call("viewer.camera", { view }) }, "⌂");
     const near = { title: "Look at the sample (Alt+0)", onclick: () => closer(view) };
     box.append(iframe, tag, home, el("button", { class: "look", ...near }, "◎"));
-    if (view === "iso")
-        box.append(el("button", { class: "inset", "aria-label": "Look at the sample", ...near }, inset));
-    return { box, iframe, tag, src };
+    const sample = el("img", { alt: "" });
+    sample.addEventListener("error", () => { sample.hidden = true; });
+    sample.addEventListener("load", () => { sample.hidden = false; });
+    box.append(el("button", { class: "inset", "aria-label": "Look at the sample", ...near }, sample));
+    return { box, iframe, tag, src, sample };
 }
 const closer = (view) => call("viewer.camera", { view, sample: true }).catch(() => { });
 export function nearSample() { for (const view of open.keys())
     if (view !== "beam")
         void closer(view); }
-const still = $("#still"), inset = el("img", { alt: "" }), INSET_MS = 2500, INSET_PX = 112;
-for (const image of [still, inset])
-    image.addEventListener("error", () => { image.hidden = true; });
-inset.addEventListener("load", () => { inset.hidden = false; });
+const still = $("#still"), CLOSE_UP_MS = 700;
+still.addEventListener("error", () => { still.hidden = true; });
 window.addEventListener("message", (e) => {
     for (const { box, iframe } of open.values())
         if (e.source === iframe.contentWindow && e.data === "drawn") {
@@ -68,12 +74,18 @@ window.addEventListener("message", (e) => {
 let posed = "", seenAt = -Infinity;
 on("state", (s) => {
     const now = JSON.stringify([s.sample, s.correction, store.layers, store.opacity, Object.values(s.axes).map((a) => a.position.toFixed(1)), document.documentElement.dataset.theme]);
-    if (now === posed || !inset.isConnected || performance.now() < seenAt + INSET_MS)
+    if (now === posed || performance.now() < seenAt + CLOSE_UP_MS)
         return;
     posed = now;
     seenAt = performance.now();
-    window.still(inset, "sample", { clientWidth: INSET_PX, clientHeight: INSET_PX });
+    closeUps();
 });
+// The sample in each pane, close up: what holds source and detector shows it small.
+function closeUps() {
+    for (const { sample } of open.values())
+        if (sample?.parentElement)
+            window.still(sample, "sample", sample.parentElement);
+}
 // Without WebGL there are no scenes; all the rest works.
 function bare() {
     document.body.dataset.webgl = "none";
@@ -112,12 +124,13 @@ export function layout(asked, step = false) {
         if (!parts.box.isConnected)
             views.append(parts.box);
     }
-    for (const [view, { box, iframe, src }] of open)
-        if (!iframe.src)
-            iframe.src = src.replace("?", `?${preset(view, box)}`);
+    for (const [view, parts] of open)
+        if (!parts.iframe.src)
+            void start(parts, view);
     for (const button of $$("#view-switch button"))
         button.setAttribute("aria-pressed", String(button.dataset.layout === which));
     localStorage.setItem("flexdt-layout", which);
+    closeUps();
     fit(true);
 }
 let last = "";
@@ -139,4 +152,4 @@ export function fit(force = false) {
     parts.tag.textContent = f.exact ? "Beam’s eye" : "Beam’s eye (oblique)";
 }
 on("state", () => fit());
-new ResizeObserver(() => fit()).observe($("#views"));
+new ResizeObserver(() => { fit(); posed = ""; }).observe($("#views"));

@@ -1,11 +1,12 @@
-"""The beam's light in the air, in two planes through the focal spot and the cone's sides.
+"""The beam's light in the air, in two faint planes through the focal spot.
 
 It is whole before the sample, and behind it as much as came through. The planes are those of the
-image's middle column and row; the cone's sides are faint. A place behind the sample has the
-transmission of the pixel at which its ray ends, so the shadow stands in the air. A look through all
-of it passes two sides and one sheet of each plane, and keeps half of what lies behind. The ball
-around the sample is left out: where in it light is lost no radiograph says, and a plane through a
-transparent sample would hide half of it. Units: mm, m for viser.
+image's middle column and row. A place behind the sample has the transmission of the pixel at which
+its ray ends, so the shadow stands in the air. A look through all of it passes one sheet of each
+plane, and keeps half of what lies behind. The ball around the sample is left out: where in it light
+is lost no radiograph says, and a plane through a transparent sample would hide half of it. The
+cone's sides are its edges alone: viser draws a translucent mesh in front of or behind all of the
+sample, whatever lies between (`web/translucent.ts`). Units: mm, m for viser.
 """
 
 from __future__ import annotations
@@ -23,11 +24,8 @@ from flexdt.twin.geometry.conventions import FloatArray
 SHAPE: Final = (160, 192)
 """Rows and columns of each plane's picture."""
 LIGHT: Final = (255, 176, 32)
-MOST: Final = 56
+MOST: Final = 66
 """Opacity of the whole beam in a plane, of 255."""
-HULL: Final = 0.08
-"""Opacity of the cone's sides."""
-SIDES: Final = np.array([[0, 2, 1], [0, 3, 2], [0, 4, 3], [0, 1, 4]], dtype=np.uint32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,10 +106,6 @@ class BeamShade:
             )
             for name in range(4)
         ]
-        self._hull = scene.add_mesh_simple(
-            "/beam/cone", np.zeros((5, 3), np.float32), SIDES, color=LIGHT, opacity=HULL,
-            side="double", **plain,
-        )  # fmt: skip
         self._newest: tuple[World, npt.NDArray[np.generic], float] | None = None
         self._lit = False
 
@@ -124,15 +118,13 @@ class BeamShade:
         """Show the beam or not."""
         if on != self._lit:
             self._lit = on
-            for handle in (*self._planes, self._hull):
+            for handle in self._planes:
                 handle.visible = on
             self._draw()
 
     def _draw(self) -> None:
         if not self._lit or self._newest is None:
             return
-        world = self._newest[0]
-        self._hull.vertices = (np.vstack([world.source, world.corners]) * MM).astype(np.float32)
         for handle, plane in zip(self._planes, fans(*self._newest), strict=True):
             handle.image = plane.rgba
             handle.render_width, handle.render_height = (side * MM for side in plane.size)

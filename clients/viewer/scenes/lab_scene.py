@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import viser
 
+from flexdt.clients.viewer.scenes import contact_shadows
 from flexdt.clients.viewer.scenes.beam_planes import LIGHT, BeamShade
 from flexdt.clients.viewer.scenes.drag_handles import Drag, Gizmos
 from flexdt.clients.viewer.scenes.lamps import light_plainly
@@ -49,6 +50,8 @@ AMBER: Final = (255, 160, 30)
 STAND: Final = "/object/stand"
 GAP_MM: Final = 0.6
 """Distance of the image from the panel's face, in front of which it floats."""
+NEAR: Final = ("sample_mount", "sample_holder")
+"""Roles of the parts that turn with the sample."""
 HERE: Final = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """The pose of what stands in the world's own frame."""
 AXIS_REACH_MM: Final = 120.0
@@ -114,6 +117,7 @@ class LabScene:
             position=(0.0, 0.55, room.floor_mm * MM),
         )  # fmt: skip
         ground = ground_of(self.machine)
+        standing = contact_shadows.standing(self.machine.components, self._bodies)
         for part in self.machine.components:
             frame = scene.add_frame(f"/machine/{part.name}", show_axes=False)
             self._frames[part.name] = frame
@@ -125,6 +129,12 @@ class LabScene:
                 position=tuple(np.array(part.mesh_at_mm if own else (0.0, 0.0, 0.0)) * MM),
                 receive_shadow=part is ground,  # a part's shadow on itself has stripes
             )  # fmt: skip
+            if part.name in standing:
+                scene.add_glb(
+                    f"/machine/{part.name}/look/shadow",
+                    contact_shadows.shadow(part, standing[part.name]),
+                    cast_shadow=False, receive_shadow=False,
+                )  # fmt: skip
         pieces, lamp = cabinet(room)
         self._solids["cabinet"], self._sent["cabinet"] = cut(pieces), HERE
         still: Any = {"cast_shadow": False, "receive_shadow": False}
@@ -254,16 +264,27 @@ class LabScene:
         self._image.wxyz = quaternion(np.stack([u, v, np.cross(u, v)], axis=1))
         self._image.position = tuple(at)
 
-    def shapes(self, world: World, shown: Shown) -> list[Shape]:
-        """What is drawn, for a picture that needs no browser; any thread may ask."""
+    def shapes(self, world: World, shown: Shown, near: bool = False) -> list[Shape]:
+        """What is drawn, for a picture that needs no browser; any thread may ask.
+
+        Args:
+            world: of the state that was drawn last.
+            shown: by the page that asks.
+            near: leave out what does not turn with the sample.
+        """
         poses = dict(self._sent)
+        turning = {"object", *(part.name for part in self.machine.components if part.role in NEAR)}
         drawn = [n for n in self._solids if (n if n == "cabinet" else "machine") in shown]
+        if near:
+            drawn = [n for n in drawn if n in turning]
         out = [shape for n in drawn for shape in placed(self._solids[n], poses[n])]
         skins = () if self._look is None or "sample" not in shown else self._look.skins
-        out += placed([shape_of(skin, shown.opacity) for skin in skins], poses["sample"])
-        if "panel" in shown:
+        solid = near and not any(skin.dense for skin in skins)
+        opacity = 1.0 if solid else shown.opacity
+        out += placed([shape_of(skin, opacity) for skin in skins], poses["sample"])
+        if "panel" in shown and not near:
             out.append(image_on(np.asarray(self._image.image), world))
-        if self._lit and "beam" in shown:
+        if self._lit and "beam" in shown and not near:
             out.append(cone(world, LIGHT, CONE))
         return out
 

@@ -55,7 +55,7 @@ LAYERS: Final[tuple[Layer, ...]] = (
     Layer("margin", "safety margin", False, ("/machine/{part}/margin",), near=True),
     Layer("sample", "sample", True, ("/sample",)),
     Layer("machine", "machine", True, ("/machine/{part}/look", "/object/stand")),
-    Layer("cabinet", "cabinet", True, ("/cabinet/walls", "/cabinet/lamp")),
+    Layer("cabinet", "cabinet", False, ("/cabinet/walls", "/cabinet/lamp")),
     Layer("orbit", "planned trajectory", True, ("/object/plan",)),
     Layer(
         "gizmos", "handles to drag", False, ("/gizmos/source", "/gizmos/object", "/gizmos/detector")

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 from flexdt.clients.viewer.scenes.still import Shape, drawn, jpeg
-from flexdt.clients.viewer.scenes.views import Standpoint, roomy
+from flexdt.clients.viewer.scenes.views import Fitted
 
 LEAST_PX, MOST_PX = 32, 1200
 MOST_BYTES: Final = 60_000
@@ -24,7 +24,7 @@ class Stills:
 
     async def picture(
         self,
-        camera: Standpoint,
+        camera: Fitted,
         asked: Mapping[str, str],
         stamp: tuple[object, ...],
         shapes: Callable[[], Sequence[Shape]],
@@ -32,17 +32,17 @@ class Stills:
         """A JPEG of at most MOST_BYTES.
 
         Args:
-            camera: from where.
+            camera: what it holds.
             asked: `w` and `h` [px], and `dark` where it is "1": the page's query.
             stamp: says whether the scene is still the same.
             shapes: makes what is seen, in a thread.
         """
         width, height = (_side(asked.get(name, "")) for name in ("w", "h"))
         dark = asked.get("dark") == "1"
-        key = camera, width, height, dark, *stamp
+        seen = camera.at(width / height)
+        key = seen, width, height, dark, *stamp
         async with self._turn:
             if key not in self._kept:
-                seen = roomy(camera, width / height)
                 self._kept[key] = await asyncio.to_thread(
                     lambda: jpeg(drawn(shapes(), seen, (width, height), dark), MOST_BYTES)
                 )

@@ -1,7 +1,9 @@
 """Views: where each camera stands and, for the beam's eye, how the page crops it.
 
-The overview holds focal spot, sample and image whatever their distances, and the sample's own view
-the ball around it, both as large as the picture allows (`fitted`).
+Every view but the beam's eye holds tube, sample and image whatever their distances, as large as
+a pane of its width and height allows (`Fitted`); the sample's own picture beside it is made in the
+same way. Source and detector are metres apart and a sample is centimetres high, so in none of them
+can the sample itself be large: the page shows it close up in each pane.
 
 The beam's eye stands in the focal spot and looks along the detector's normal, so the panel is an
 undistorted rectangle. Where the piercing point is off its centre the picture is rendered larger and
@@ -11,9 +13,12 @@ cropped by the page, since a browser's camera is symmetric. Units: m for viser, 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
 from flexdt.clients.viewer.scenes.world import MM, World
 from flexdt.twin.geometry.conventions import FloatArray
@@ -23,13 +28,38 @@ WIDEST = 3.0
 """The beam's eye is rendered at most this many times as wide or high as the panel; beyond, the
 camera looks at the panel's centre instead and the frame is no longer exact."""
 WIDE = 1.35
-"""Aspect (width over height) for which cameras are made; narrower pictures open wider (`roomy`)."""
-ROOM = 0.86
+"""Aspect (width over height) of a pane of which nothing is known yet."""
+NARROWEST, BROADEST = 0.3, 4.0
+"""Aspects for which cameras are made."""
+ROOM = 0.9
 """Part of the picture, in width and height, that what is fitted takes."""
-TUBE_MM = 60.0
-"""Of the tube behind its focal spot that the overview shows."""
-ISO_WAY, ISO_FOV = (-0.5, 0.75, -0.42), math.radians(38.0)
-SAMPLE_WAY, SAMPLE_FOV = (-0.62, 0.68, -0.39), math.radians(30.0)
+TUBE_MM = (110.0, 110.0, 100.0)
+"""Of the tube around and behind its focal spot that views show: width, length, height."""
+RIM_CORNERS: Final = 12
+"""Of the polygon around the cylinder in which a sample turns."""
+FOV_RAD: Final = {"iso": math.radians(30.0), "side": math.radians(24.0),
+                  "free": math.radians(34.0), "sample": math.radians(30.0)}  # fmt: skip
+"""View -> vertical opening of its camera."""
+
+
+def _way(yaw_deg: float, pitch_deg: float) -> Vector:
+    """Look along the beam, turned to its side (positive: from the right) and down.
+
+    >>> _way(0.0, 0.0)
+    (-0.0, 1.0, -0.0)
+    """
+    yaw, pitch = math.radians(yaw_deg), math.radians(pitch_deg)
+    level = math.cos(pitch)
+    return (-math.sin(yaw) * level, math.cos(yaw) * level, -math.sin(pitch))
+
+
+WAYS: Final = {
+    "iso": tuple(_way(yaw, pitch) for yaw in (40.0, 48.0) for pitch in (20.0, 26.0)),
+    "side": (_way(90.0, 0.0),),
+    "free": tuple(_way(-yaw, pitch) for yaw in (40.0, 50.0) for pitch in (24.0, 30.0)),
+    "sample": (_way(42.0, 20.0),),
+}
+"""View -> directions from which its camera may look; it takes the one that shows most."""
 
 
 @dataclass(frozen=True)
@@ -42,44 +72,136 @@ class Standpoint:
     fov: float
 
 
-SIDE = Standpoint((3.15, 0.52, 0.1), (0.0, 0.52, 0.1), (0.0, 0.0, 1.0), math.radians(30.0))
 FREE = Standpoint((-0.95, 0.1, 0.52), (0.0, 0.72, 0.0), (0.0, 0.0, 1.0), math.radians(45.0))
-FIXED = {"side": SIDE, "free": FREE}
-"""View -> camera, for those that do not depend on the machine's pose."""
+"""Of exported scenes of which nobody has looked at one."""
 
 
-def presets(world: World, radius_mm: float) -> dict[str, Standpoint]:
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """What a view holds, and from where it may be looked at.
+
+    Attributes:
+        points: (n, 3) [m], all of which are in the picture.
+        ways: directions of the look.
+        fov: vertical opening [rad].
+        around: (3,) [m], what turns of the camera keep at their distance.
+    """
+
+    points: FloatArray
+    ways: tuple[Vector, ...]
+    fov: float
+    around: FloatArray
+
+    def at(self, aspect: float) -> Standpoint:
+        """The camera for a pane: of those that hold all points, the one nearest to the middle.
+
+        Args:
+            aspect: the pane's width over its height.
+        """
+        cameras = [fitted(self.points, way, self.fov, self.around, aspect) for way in self.ways]
+        return min(cameras, key=lambda one: float(np.linalg.norm(self.around - one.position)))
+
+    def fits(self, camera: Standpoint, aspect: float) -> bool:
+        """Whether a camera holds all points and wastes no room.
+
+        Args:
+            camera: where it stands now.
+            aspect: the pane's width over its height.
+        """
+        eye = np.asarray(camera.position)
+        ahead = np.asarray(camera.look_at) - eye
+        axes = _axes(ahead / np.linalg.norm(ahead))
+        x, y, depth = axes @ (self.points - eye).T
+        if depth.min() <= 0.0:
+            return False
+        slope = depth * math.tan(0.5 * camera.fov)
+        reach = max(
+            float(np.abs(x / slope).max()) / bounded(aspect), float(np.abs(y / slope).max())
+        )
+        return LEAST_REACH < reach < 1.0
+
+
+LEAST_REACH: Final = 0.75
+"""Part of the picture below which what a view holds has become too small."""
+
+
+def bounded(aspect: float) -> float:
+    """An aspect for which cameras are made."""
+    return min(BROADEST, max(NARROWEST, aspect))
+
+
+def presets(world: World, radius_mm: float, rim_mm: FloatArray | None = None) -> dict[str, Fitted]:
     """View -> the camera that it opens with, for all but the beam's eye.
 
     Args:
         world: the machine's pose.
         radius_mm: of the ball around the sample.
+        rim_mm: (n, 3) of the cylinder in which the sample turns (`rim`); None is the ball.
     """
     middle = world.sample.shift
     ball = middle + max(radius_mm, 5.0) * np.concatenate([np.eye(3), -np.eye(3)])
-    tube = world.source + TUBE_MM * np.outer((0.0, 1.0), (0.0, -1.0, 0.0))
-    whole = np.concatenate([tube, ball, world.corners])
-    iso = fitted(whole * MM, ISO_WAY, ISO_FOV, middle * MM)
-    return {**FIXED, "iso": iso, "sample": fitted(ball * MM, SAMPLE_WAY, SAMPLE_FOV, middle * MM)}
+    width, length, height = TUBE_MM
+    tube = world.source + [
+        [0.5 * x * width, -y * length, 0.5 * z * height]
+        for x, y, z in ((0, 0, 0), (-1, 1, -1), (-1, 1, 1), (1, 1, -1), (1, 1, 1))
+    ]
+    whole = np.concatenate([tube, ball, world.corners]) * MM
+    near = (ball if rim_mm is None else rim_mm) * MM
+    center = 0.5 * (near.min(axis=0) + near.max(axis=0))
+    views = {
+        view: Fitted(whole, WAYS[view], FOV_RAD[view], middle * MM)
+        for view in ("iso", "side", "free")
+    }
+    return {**views, "sample": Fitted(near, WAYS["sample"], FOV_RAD["sample"], center)}
 
 
-def fitted(points: FloatArray, way: Vector, fov: float, around: FloatArray) -> Standpoint:
+def rim(world: World, vertices_m: Sequence[npt.NDArray[np.float32]]) -> FloatArray | None:
+    """Points (n, 3) [mm] around the cylinder in which the sample turns; None without a sample.
+
+    Args:
+        world: how the sample stands.
+        vertices_m: of its meshes, in its own frame.
+    """
+    if not any(len(some) for some in vertices_m):
+        return None
+    ends = np.array([[some.min(axis=0), some.max(axis=0)] for some in vertices_m if len(some)]) / MM
+    low, high = ends[:, 0].min(axis=0), ends[:, 1].max(axis=0)
+    pick = np.array([[k >> 2 & 1, k >> 1 & 1, k & 1] for k in range(8)])
+    corners = world.sample @ np.where(pick, high, low)
+    middle = world.axis
+    radius = float(np.linalg.norm((corners - middle)[:, :2], axis=1).max())
+    angles = np.arange(RIM_CORNERS) * 2.0 * np.pi / RIM_CORNERS
+    outer = radius / math.cos(np.pi / RIM_CORNERS)  # so that the polygon holds the circle
+    circle = outer * np.stack([np.cos(angles), np.sin(angles), 0.0 * angles], axis=1)
+    levels = [corners[:, 2].min(), corners[:, 2].max()]
+    return np.concatenate([circle + [middle[0], middle[1], level] for level in levels])
+
+
+def _axes(ahead: FloatArray) -> FloatArray:
+    """Right, up and ahead of a camera as rows (3, 3); the world's z is upwards."""
+    right = np.cross(ahead, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(right, ahead), ahead])
+
+
+def fitted(
+    points: FloatArray, way: Vector, fov: float, around: FloatArray, aspect: float = WIDE
+) -> Standpoint:
     """The nearest camera that looks along `way` and holds all points; up is +z.
 
     Args:
         points: (n, 3) [m].
         way: direction of the look.
-        fov: vertical opening of a picture that is `WIDE` [rad].
+        fov: vertical opening [rad].
         around: (3,) [m], what turns of the camera keep at their distance.
+        aspect: the pane's width over its height.
     """
     ahead = np.asarray(way) / np.linalg.norm(way)
-    right = np.cross(ahead, (0.0, 0.0, 1.0))
-    right /= np.linalg.norm(right)
-    axes = np.stack([right, np.cross(right, ahead), ahead])
+    axes = _axes(ahead)
     seen = points @ axes.T
     eye, back = np.zeros(3), []
-    for k, aspect in ((0, WIDE), (1, 1.0)):
-        slope = ROOM * aspect * math.tan(0.5 * fov)
+    for k, share in ((0, bounded(aspect)), (1, 1.0)):
+        slope = ROOM * share * math.tan(0.5 * fov)
         # On the left each point wants x - eye >= -slope * (depth - eye's depth); right likewise.
         left = (seen[:, k] + slope * seen[:, 2]).min()
         right_of = (seen[:, k] - slope * seen[:, 2]).max()
@@ -89,12 +211,6 @@ def fitted(points: FloatArray, way: Vector, fov: float, around: FloatArray) -> S
     position = eye @ axes
     target = position + ahead * ((around - position) @ ahead)
     return Standpoint(_vector(position), _vector(target), (0.0, 0.0, 1.0), fov)
-
-
-def roomy(camera: Standpoint, aspect: float) -> Standpoint:
-    """The camera with as wide an opening in a narrow picture as in one that is `WIDE`."""
-    wider = max(1.0, WIDE / max(aspect, 0.3))
-    return replace(camera, fov=2.0 * math.atan(wider * math.tan(0.5 * camera.fov)))
 
 
 def beam_view(world: World) -> tuple[Standpoint, dict[str, object]]:

@@ -12,7 +12,6 @@ import {
 } from "./fingerprint.js";
 import type {
   Answers,
-  Camera,
   Events,
   Framing,
   HelloResult,
@@ -57,7 +56,7 @@ export const store = {
   refused: null as string | null,
   problem: null as string | null,
   coneVec: null as number[] | null,
-  cameras: null as Record<string, Camera> | null,
+  drawn: false,
 };
 // Older than OLD_S, what is shown is said to be old; after SILENT_S nobody waits for answers any
 // more.
@@ -193,7 +192,7 @@ const handlers: { [T in keyof Messages]: (m: Messages[T]) => void } = {
       refused: null,
       twin: m.connected,
       problem: m.problem,
-      cameras: m.cameras,
+      drawn: m.drawn,
     });
     store.hello = m.hello ?? store.hello;
     if (store.state) store.now = ofNow(store.state, store.coneVec, store.hello);

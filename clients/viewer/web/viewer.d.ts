@@ -42,7 +42,7 @@ interface Failure { code: number; message: string; data?: unknown }
 export interface Messages {
   answer: { id: number; result: unknown; error?: Failure };
   state: { state: State; framing: Framing; near: Near; cone_vec: number[]; at: number };
-  link: { connected: boolean; problem: string | null; cameras: Record<string, Camera>; twin: string; hello: HelloResult | null };
+  link: { connected: boolean; problem: string | null; drawn: boolean; twin: string; hello: HelloResult | null };
   session: { connected: boolean; session: string | null };
   volume: VolumeMessage;
   layers: { shown: Record<string, boolean>; opacity: number };
@@ -68,6 +68,7 @@ type WireAnswers = { [M in keyof Methods]: Methods[M][1] };
 export interface Answers extends WireAnswers {
   "calibration.fit": FitReport;
   "viewer.ray": { paths_mm: Record<string, number>; length_mm: number };
+  "viewer.preset": Partial<Camera>;
   "viewer.spectrum": { energy_keV: number[]; photons: number[]; mean_keV: number; filters: Array<{ material: string; thickness_mm: number }>; limits: { kV: Pair; power_W: Pair; exposure_ms: Pair } };
   "viewer.plan": PlanDocument;
   "viewer.recorded": DatasetResult;

@@ -5,9 +5,8 @@ import { call, emit, on, pageId, store } from "./link.js";
 import { remember } from "./address.js";
 
 const NAMES: Record<View, string> = { iso: "Isometric", beam: "Beam’s eye", side: "Side", free: "Free" };
-const WIDE = 1.35; // aspect for which the cameras are made, as in scenes/world.py
 type Layout = View | "four" | "none";
-interface Frame { box: HTMLElement; iframe: HTMLIFrameElement; crop?: HTMLElement; tag: HTMLElement; src: string }
+interface Frame { box: HTMLElement; iframe: HTMLIFrameElement; crop?: HTMLElement; tag: HTMLElement; src: string; sample?: HTMLImageElement }
 const open = new Map<View, Frame>();
 $("#view-switch").append(...Object.entries({ four: "Four views", ...NAMES }).map(([name, words]) => el("button", { "data-layout": name, onclick: () => layout(name, true) }, words)));
 export let current: Layout | null = null;
@@ -28,13 +27,18 @@ const GAP_MS = Number(query.get("gap") ?? (software ? 400 : 0));
 const DPR = query.get("dpr") ?? (devicePixelRatio > 1.5 && !software ? "" : "1");
 
 // The preset from the start, so that nothing jumps when the viewer sets it again. The beam's eye has none: it moves
-// with the machine, and the camera that this page was told is the one of the moment in which it connected.
-function preset(view: View, box: HTMLElement) {
-  const camera = store.cameras?.[view];
-  if (!camera || view === "beam") return "";
-  const { position: p, look_at: l, fov } = camera, aspect = box.clientWidth / Math.max(1, box.clientHeight);
-  const wider = Math.max(1, WIDE / Math.max(aspect, 0.3));
-  return `initialCameraPosition=${p.join()}&initialCameraLookAt=${l.join()}&initialCameraFov=${2 * Math.atan(wider * Math.tan(fov / 2))}&`;
+// with the machine.
+async function preset(view: View, box: HTMLElement): Promise<string> {
+  if (view === "beam") return "";
+  const aspect = Math.min(20, Math.max(0.05, box.clientWidth / Math.max(1, box.clientHeight)));
+  const camera = await call("viewer.preset", { view, aspect }).catch(() => null);
+  if (!camera?.position || !camera.look_at || !camera.fov) return "";
+  const { position, look_at, fov } = camera;
+  return `initialCameraPosition=${position.join()}&initialCameraLookAt=${look_at.join()}&initialCameraFov=${fov}&`;
+}
+async function start({ box, iframe, src }: Frame, view: View): Promise<void> {
+  const found = await preset(view, box);
+  if (open.get(view)?.iframe === iframe && !iframe.src) iframe.src = src.replace("?", `?${found}`);
 }
 
 function frame(view: View): Frame {
@@ -51,27 +55,33 @@ function frame(view: View): Frame {
   const home = el("button", { class: "home", title: "Back to this view's preset", onclick: () => call("viewer.camera", { view }) }, "⌂");
   const near = { title: "Look at the sample (Alt+0)", onclick: () => closer(view) };
   box.append(iframe, tag, home, el("button", { class: "look", ...near }, "◎"));
-  if (view === "iso") box.append(el("button", { class: "inset", "aria-label": "Look at the sample", ...near }, inset));
-  return { box, iframe, tag, src };
+  const sample = el("img", { alt: "" });
+  sample.addEventListener("error", () => { sample.hidden = true; });
+  sample.addEventListener("load", () => { sample.hidden = false; });
+  box.append(el("button", { class: "inset", "aria-label": "Look at the sample", ...near }, sample));
+  return { box, iframe, tag, src, sample };
 }
 const closer = (view: View) => call("viewer.camera", { view, sample: true }).catch(() => {});
 export function nearSample(): void { for (const view of open.keys()) if (view !== "beam") void closer(view); }
 
 // What the viewer computes: the view until its frame has drawn the machine, and the sample, large, beside it.
 declare global { interface Window { still: (image: HTMLImageElement, view: string, size: { clientWidth: number; clientHeight: number }) => void } }
-const still = $<HTMLImageElement>("#still"), inset = el("img", { alt: "" }), INSET_MS = 2500, INSET_PX = 112;
-for (const image of [still, inset]) image.addEventListener("error", () => { image.hidden = true; });
-inset.addEventListener("load", () => { inset.hidden = false; });
+const still = $<HTMLImageElement>("#still"), CLOSE_UP_MS = 700;
+still.addEventListener("error", () => { still.hidden = true; });
 window.addEventListener("message", (e) => {
   for (const { box, iframe } of open.values()) if (e.source === iframe.contentWindow && e.data === "drawn") { box.classList.add("live"); still.hidden = true; }
 });
 let posed = "", seenAt = -Infinity;
 on("state", (s) => {
   const now = JSON.stringify([s.sample, s.correction, store.layers, store.opacity, Object.values(s.axes).map((a) => a.position.toFixed(1)), document.documentElement.dataset.theme]);
-  if (now === posed || !inset.isConnected || performance.now() < seenAt + INSET_MS) return;
+  if (now === posed || performance.now() < seenAt + CLOSE_UP_MS) return;
   posed = now; seenAt = performance.now();
-  window.still(inset, "sample", { clientWidth: INSET_PX, clientHeight: INSET_PX });
+  closeUps();
 });
+// The sample in each pane, close up: what holds source and detector shows it small.
+function closeUps() {
+  for (const { sample } of open.values()) if (sample?.parentElement) window.still(sample, "sample", sample.parentElement);
+}
 
 // Without WebGL there are no scenes; all the rest works.
 function bare() {
@@ -97,9 +107,10 @@ export function layout(asked: string, step = false): void {
     open.set(view, parts);
     if (!parts.box.isConnected) views.append(parts.box);
   }
-  for (const [view, { box, iframe, src }] of open) if (!iframe.src) iframe.src = src.replace("?", `?${preset(view, box)}`);
+  for (const [view, parts] of open) if (!parts.iframe.src) void start(parts, view);
   for (const button of $$("#view-switch button")) button.setAttribute("aria-pressed", String(button.dataset.layout === which));
   localStorage.setItem("flexdt-layout", which);
+  closeUps();
   fit(true);
 }
 
@@ -120,4 +131,4 @@ export function fit(force = false): void {
 }
 
 on("state", () => fit());
-new ResizeObserver(() => fit()).observe($("#views"));
+new ResizeObserver(() => { fit(); posed = ""; }).observe($("#views"));

@@ -145,6 +145,7 @@ export type Plan = { text?: string | null };
 export type PredictedSetting = {
   kV: number; filter: string; exposure_ms: number; averages: number; cnr: number | null; kerma_mGy: number
 };
+export type Preset = { view?: "iso" | "beam" | "side" | "free"; aspect?: number };
 export type Problem = {
   severity: "error" | "warning"; code: string; line: number | null; column: number | null; message: string
 };
@@ -253,6 +254,7 @@ export interface Methods {
   "viewer.layers": [Layers, object];
   "viewer.theme": [Theme, object];
   "viewer.camera": [Camera, object];
+  "viewer.preset": [Preset, object];
   "viewer.feed": [Feed, object];
   "viewer.window": [Window, object];
   "viewer.ray": [Ray, object];
