@@ -25,6 +25,7 @@ from flexdt.phantoms.bricks import lego_phantom
 from flexdt.phantoms.checked_reading import PhantomError
 from flexdt.phantoms.files import phantom_files as files
 from flexdt.phantoms.files.mesh_files import FORMATS, filled_mesh, mesh_phantom, voxel_phantom
+from flexdt.phantoms.gears import gear_phantom
 from flexdt.phantoms.materials import material as material_of
 from flexdt.phantoms.phantom import Phantom, assemble
 from flexdt.phantoms.pieces import size_about_origin
@@ -97,6 +98,7 @@ _MAKERS: Final[Mapping[str, Callable[[], Phantom]]] = {
     "lego": lego_phantom,
     "shepp-logan": shepp_logan,
     "chiral": chiral_phantom,
+    "gear": gear_phantom,
 }
 
 
