@@ -38,7 +38,7 @@ from flexdt.clients.viewer.scenes.still_pictures import Stills
 from flexdt.clients.viewer.scenes.world import World, beads_on, world_of
 from flexdt.clients.viewer.shown_images import ShownImage, grey, packed, window_of
 from flexdt.clients.viewer.viser_gate import Scenes
-from flexdt.clients.viewer.volumes.live_volume import points_of
+from flexdt.clients.viewer.volumes.grown_surface import mesh_of
 from flexdt.clients.viewer.volumes.reconstruction_process import LiveReconstruction
 from flexdt.clients.viewer.watched_tasks import watched
 from flexdt.protocol import RpcError
@@ -424,7 +424,7 @@ class Viewer:
     def _grown(self, line: str) -> None:
         surface, slices = line.split("\t")
         if (told := json.loads(surface)) is not None and self.lab is not None:
-            self.lab.show_surface(points_of(told), told["size_mm"])
+            self.lab.show_surface(*mesh_of(told))
         for page in self.pages.values():
             if page.live:
                 page.show("volume", slices)

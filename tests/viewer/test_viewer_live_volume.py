@@ -17,19 +17,18 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import tifffile
+import trimesh
 
 from flexdt.clients.cli import main
+from flexdt.clients.viewer.volumes.grown_surface import mesh_of, net, otsu, surface
 from flexdt.clients.viewer.volumes.live_volume import (
-    MOST_POINTS,
     TOP,
     Held,
     block,
     compare,
     exact,
     grow,
-    points_of,
     reconstruct,
-    surface,
 )
 from flexdt.clients.viewer.volumes.reconstruction_process import LiveReconstruction, wish
 from flexdt.clients.viewer.volumes.volume_truth import figures, main_level, truth_of
@@ -170,32 +169,65 @@ def test_the_volume_is_no_mirror_image(tmp_path: Path, seed: int) -> None:
     assert grown.grid is not None
     found = dense[::-1] * voxel_mm + grown.grid.center_mm
     np.testing.assert_allclose(found, (x, y, z), atol=0.7 * voxel_mm)
-    # Points of the surface, on the stage: all about the ball, and everywhere on it.
-    points, size = points_of(told[-2]["surface"]), told[-2]["surface"]["size_mm"]
+    # The surface, on the stage: all about the ball, and everywhere on it.
+    surfaces = [document["surface"] for document in told if "surface" in document]
+    points, _ = mesh_of(surfaces[-1])
     from_ball = points - [x, y, z]
     apart = np.linalg.norm(from_ball, axis=1)
-    assert np.abs(apart - 5.5).max() < 1.5 * size
+    assert np.abs(apart - 5.5).max() < 1.5 * voxel_mm
     directions = rng.normal(size=(50, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     assert (directions @ (from_ball / apart[:, None]).T).max(axis=1).min() > 0.9
 
 
-def test_a_surface_has_few_points_whatever_the_volume() -> None:
-    """A box in a large volume of voxels that are no cubes: its faces, a cell off at most, although
-    streaks of 0.6 of its value, as few views leave them, are all over the volume."""
-    grown = np.random.default_rng(1).normal(0.0, 0.01, (200, 150, 260)).astype(np.float32)
+def test_the_surface_of_a_box_is_closed_and_has_its_volume() -> None:
+    """In a large volume of voxels that are no cubes, with streaks and noise beside the box."""
+    rng = np.random.default_rng(1)
+    grown = rng.normal(0.0, 0.01, (200, 150, 260)).astype(np.float32)
     grown[40:160, 30:90, 50:200] += 1.0  # (y, x, z)
     streaks = np.add.outer(np.arange(200) // 5, np.arange(150) // 5) % 2
-    grown += (1.2 * streaks - 0.6).astype(np.float32)[:, :, None]
-    told = surface(grown, (0.5, 0.4, 0.3), (10.0, -20.0, 5.0))
-    points, size = points_of(told), told["size_mm"]
-    assert size == 5 * 0.5
-    assert 500 < len(points) <= MOST_POINTS
+    grown += (0.2 * streaks - 0.1).astype(np.float32)[:, :, None]
+    vertices, faces = mesh_of(surface(grown, (0.5, 0.4, 0.3), (10.0, -20.0, 5.0)))
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    assert mesh.is_watertight
+    sides = np.array([60 * 0.5, 120 * 0.4, 150 * 0.3])
+    assert mesh.volume == pytest.approx(sides.prod(), rel=0.06)
     low = np.array([10 + (30 - 75) * 0.5, -20 + (40 - 100) * 0.4, 5 + (50 - 130) * 0.3])
-    high = np.array([10 + (90 - 75) * 0.5, -20 + (160 - 100) * 0.4, 5 + (200 - 130) * 0.3])
-    np.testing.assert_allclose([points.min(axis=0), points.max(axis=0)], [low, high], atol=size)
-    to_face = np.minimum(np.abs(points - low), np.abs(points - high)).min(axis=1)
-    assert to_face.max() < size
+    cell_mm = 5 * 0.5
+    np.testing.assert_allclose(mesh.bounds, [low, low + sides], atol=0.5 * cell_mm)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_net_of_drawn_balls_is_closed_and_outward(seed: int) -> None:
+    """Two balls that may touch: their volume is that of the formula, where they are apart."""
+    rng = np.random.default_rng(seed)
+    at = np.stack(np.mgrid[:40, :44, :48], axis=-1).astype(float)
+    centers, radii = rng.uniform(13.0, 26.0, (2, 3)), rng.uniform(4.0, 9.0, 2)
+    depth = [r - np.linalg.norm(at - c, axis=-1) for c, r in zip(centers, radii, strict=True)]
+    vertices, faces = net(np.max(depth, axis=0), 0.0)
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    mesh.merge_vertices()
+    assert mesh.volume > 0.0
+    away = [np.linalg.norm(vertices - c, axis=1) - r for c, r in zip(centers, radii, strict=True)]
+    gaps = np.abs(away).min(axis=0)
+    assert gaps.max() < 1.0, "within a cell, in the crease between balls that touch, too"
+    if np.linalg.norm(centers[0] - centers[1]) > radii.sum() + 2.0:
+        assert mesh.volume == pytest.approx(4.0 / 3.0 * np.pi * (radii**3).sum(), rel=0.04)
+
+
+def test_otsus_threshold_parts_what_no_other_threshold_parts_better() -> None:
+    """Against the criterion itself, computed at every threshold."""
+    rng = np.random.default_rng(3)
+    for _ in range(5):
+        share, apart = rng.uniform(0.02, 0.5), rng.uniform(1.5, 6.0)
+        values = np.where(rng.random(20_000) < share, apart, 0.0) + rng.normal(0, 0.4, 20_000)
+
+        def within(level: float, values: Any = values) -> float:
+            parts = values[values > level], values[values <= level]
+            return float(sum(part.var() * len(part) for part in parts if len(part)))
+
+        least = min(within(v) for v in np.linspace(values.min(), values.max(), 400))
+        assert within(otsu(values)) <= least * 1.002
 
 
 @pytest.mark.slow

@@ -43,6 +43,8 @@ CONE: Final = 0.2
 """Opacity of the whole beam in a picture that needs no browser."""
 BEAM_OFF: Final = (120, 140, 165)
 SURFACE: Final = (70, 190, 255)
+FADED: Final = 0.12
+"""Opacity of a sample whose volume is drawn within it, at most."""
 FLOOR: Final = (140, 150, 165)
 RANGE: Final = (240, 150, 40)
 RED: Final = (230, 50, 40)
@@ -98,7 +100,7 @@ class LabScene:
             for node, visible in self._visible(Shown()).items():
                 handle: Any = server.scene.get_handle_by_name(node)
                 handle.visible = visible
-        self.plain = self.nodes(Shown())
+        self.plain = self.nodes(Shown(), faded=False)
         """How all nodes are built; each frame is told what its page shows otherwise."""
 
     # -- building ----------------------------------------------------------------------------
@@ -298,20 +300,31 @@ class LabScene:
         with self._server.atomic():
             self._shade.show(world, lines, 0.0 if self._look is None else self._look.radius_mm)
 
-    def show_surface(self, points: FloatArray | None, size_mm: float = 1.0) -> None:
+    def show_surface(
+        self, vertices_mm: FloatArray | None, faces: npt.NDArray[np.int32] | None = None
+    ) -> None:
         """Draw what a scan has reconstructed so far, on the stage; None: no longer.
 
+        The sample itself fades meanwhile, so that its volume is seen within it.
+
         Args:
-            points: (n, 3) [mm, object frame].
-            size_mm: of a point.
+            vertices_mm: (v, 3) [mm, object frame].
+            faces: (f, 3), outward.
         """
-        if self._surface is not None:
-            self._surface.remove()
-            self._surface = None
-        if points is not None and len(points):
-            self._surface = self._server.scene.add_point_cloud(
-                "/object/surface", (points * MM).astype(np.float32), SURFACE,
-                point_size=size_mm * MM, point_shape="rounded",
+        with self._server.atomic():
+            if vertices_mm is None or faces is None or not len(faces):
+                if self._surface is not None:
+                    self._surface.remove()
+                self._surface = None
+                return
+            vertices = (vertices_mm * MM).astype(np.float32)
+            triangles = np.asarray(faces, dtype=np.uint32)
+            if self._surface is not None:
+                self._surface.vertices, self._surface.faces = vertices, triangles
+                return
+            self._surface = self._server.scene.add_mesh_simple(
+                "/object/surface", vertices, triangles, color=SURFACE, side="double",
+                cast_shadow=False, receive_shadow=False,
             )  # fmt: skip
 
     def wear(self, look: SampleLook) -> None:
@@ -331,7 +344,7 @@ class LabScene:
                 for skin in look.skins
             ]  # fmt: skip
             self._stand(look)
-        self.plain = self.nodes(Shown())
+        self.plain = self.nodes(Shown(), faded=False)
 
     def _stand(self, look: SampleLook) -> None:
         """A thin rod from the mount to the sample: drawn only, X-rays do not see it."""
@@ -350,15 +363,18 @@ class LabScene:
             self._solids["object"] = cut([rod])
             self._server.scene.add_glb(name, glb([rod]), receive_shadow=False)
 
-    def nodes(self, shown: Shown, near: Collection[str] = ()) -> Nodes:
+    def nodes(self, shown: Shown, near: Collection[str] = (), faded: bool = True) -> Nodes:
         """The nodes of all layers, for frames of a page that shows `shown`.
 
         Args:
             near: components near a contact, whose collision bodies and margins are drawn, too.
+            faded: whether the sample fades where its volume is drawn within it.
         """
         out = {n: {"visible": visible} for n, visible in self._visible(shown, near).items()}
         skins = () if self._look is None else self._look.skins
-        clear = {f"/sample/{skin.name}": _clear(shown.opacity, skin.dense) for skin in skins}
+        within = faded and self._surface is not None
+        opacity = min(shown.opacity, FADED) if within else shown.opacity
+        clear = {f"/sample/{s.name}": _clear(opacity, s.dense and not within) for s in skins}
         return {**out, **clear}
 
     def _visible(self, shown: Shown, near: Collection[str] = ()) -> dict[str, bool]:

@@ -2,9 +2,10 @@
 
 `python -m flexdt.clients.viewer.volumes.live_volume` loads what it needs and reads a line, FOLDER,
 SIDE and perhaps `past`, tabs between them. It follows that data set then and prints a line of JSON
-whenever its volume has changed: views so far and of how many, its size, and points on the surface
-of what is dense, for the scenes. The geometry of all images is written when a scan begins, so each
-view has its final weight at once, and the values of a grown volume are those of the finished one.
+whenever its volume has changed: views so far and of how many, its size, and now and then the
+surface of what is dense, for the scenes. The geometry of all images is written when a scan begins,
+so each view has its final weight at once, and the values of a grown volume are those of the
+finished one.
 
 With `past` it is the volume of `flexdt reconstruct` from the images that are there.
 
@@ -22,14 +23,13 @@ because codes are rounded.
 
 from __future__ import annotations
 
-import base64
 import json
 import os
 import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -38,6 +38,7 @@ from typing import Any, Final
 import numba
 import numpy as np
 
+from flexdt.clients.viewer.volumes.grown_surface import FINISHED_CELLS, surface
 from flexdt.clients.viewer.volumes.volume_truth import figures, truth_of
 from flexdt.library.data_set import DataSet
 from flexdt.library.reading.folders import load_dataset
@@ -46,7 +47,7 @@ from flexdt.runtime.files.dataset_folder import read_image
 from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.projection import Volume, as_volume
 from flexdt.twin.reconstruction.acquisition.rectify import field_of_view
@@ -69,9 +70,8 @@ MOST_VIEWS: Final = 360
 LOOK_S: Final = 0.1
 TELL_S: Final = 0.4
 """Between two lines, at least."""
-COARSE: Final = 64
-"""Cells along the longest side of the grid on which the surface is looked for."""
-MOST_POINTS: Final = 12_000
+SURFACE_S: Final = 1.2
+"""Between two surfaces for the scenes, at least."""
 
 Tell = Callable[[dict[str, Any]], None]
 
@@ -173,7 +173,7 @@ def grow(held: Held, folder: Path, side: int, alive: Callable[[], bool] = lambda
     whole = field_of_view(cone_vec, shape)
     voxel_mm = whole.shape[2] * float(np.max(whole.voxel_mm)) / side
     like = as_volume(field_of_view(cone_vec, shape, voxel_mm))
-    target, told = OnProcessor(like), 0.0
+    target, told, drawn = OnProcessor(like), 0.0, 0.0
     held.hold(target.volume().transpose(2, 0, 1), like)
 
     def parts() -> Iterator[Float32Array]:
@@ -187,16 +187,16 @@ def grow(held: Held, folder: Path, side: int, alive: Callable[[], bool] = lambda
             yield binned_mean(normalise(read_image(path, data.shape)), factor)[None]
 
     def progress(done: float) -> None:
-        nonlocal told
+        nonlocal told, drawn
         if done < 1.0 and time.monotonic() < told + TELL_S:
             return
         told = time.monotonic()
         views = round(done * len(indices))
-        held.say(
-            views=views,
-            of=len(indices),
-            surface=surface(target.volume(), like.voxel_mm, like.center_mm),
-        )
+        more = {}
+        if done == 1.0 or told >= drawn + SURFACE_S:
+            drawn = told
+            more["surface"] = surface(target.volume(), like.voxel_mm, like.center_mm)
+        held.say(views=views, of=len(indices), **more)
 
     volume = fdk_parts(parts, cone_vec, shape, like, progress=progress, target=target)
     held.hold(volume.data, like)  # what no view has covered is no number now
@@ -233,6 +233,8 @@ def reconstruct(held: Held, folder: Path, side: int) -> None:
         uncovered=float(1.0 - np.isfinite(volume.data).mean()),
         **_facts(data),
     )
+    grown = volume.data.transpose(1, 2, 0)
+    held.say(surface=surface(grown, volume.voxel_mm, volume.center_mm, FINISHED_CELLS))
     for name in ("sigma", "bias_bound"):  # the volume need not wait for its errors
         if (found := getattr(volume, name)) is not None:
             held.volumes[name] = found
@@ -285,40 +287,6 @@ def compare(held: Held, now: NamedCorrection | None) -> None:
             made.data, truth, voxel_mm
         )
     held.keep(comparing=1.0, compared=rows, volumes=list(held.volumes))
-
-
-def surface(grown: Float32Array, voxel_mm: Any, center_mm: Any) -> dict[str, Any]:
-    """Where what is dense ends, on a coarse grid: `MOST_POINTS` points at most [mm, object frame].
-
-    Dense is what lies above the middle between most cells and the densest. Each is the mean of 27,
-    so that the streaks of few views do not count.
-
-    Args:
-        grown: (y, x, z).
-        voxel_mm, center_mm: of the volume (x, y, z), as `Volume` has them.
-    """
-    from scipy.ndimage import uniform_filter
-
-    factor = -(-max(grown.shape) // COARSE)
-    shape = [n // factor for n in grown.shape]
-    cut = grown[tuple(slice(n * factor) for n in shape)]
-    blocks = [part for n in shape for part in (n, factor)]
-    coarse = uniform_filter(cut.reshape(blocks).mean(axis=(1, 3, 5)), 3)
-    usual, densest = np.percentile(coarse, (50.0, 99.8))
-    dense = np.pad(coarse > 0.5 * (usual + densest), 1)
-    inside = np.all([np.roll(dense, s, axis=k) for k in range(3) for s in (-1, 1)], axis=0)
-    found = np.argwhere((dense & ~inside)[1:-1, 1:-1, 1:-1])
-    found = found[:: max(1, -(-len(found) // MOST_POINTS))]
-    steps = ((found + 0.5) * factor - np.array(grown.shape) / 2)[:, [1, 0, 2]]
-    points = np.asarray(center_mm) + steps * np.asarray(voxel_mm)
-    data = base64.b64encode(points.astype("<f4").tobytes()).decode("ascii")
-    return {"points": data, "size_mm": factor * float(np.max(voxel_mm))}
-
-
-def points_of(told: Mapping[str, Any]) -> FloatArray:
-    """The points (n, 3) of a `surface` [mm, object frame]."""
-    points = np.frombuffer(base64.b64decode(told["points"]), "<f4")
-    return points.reshape(-1, 3).astype(np.float64)
 
 
 def _wait(path: Path, alive: Callable[[], bool]) -> None:
