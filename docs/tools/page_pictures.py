@@ -51,10 +51,8 @@ def lab() -> Iterator[str]:
             process.wait(30)
 
 
-def opened(browser: Any, url: str, view: str, tab: str, fresh: bool = False) -> Any:
+def opened(browser: Any, url: str, view: str, tab: str) -> Any:
     page = browser.new_page(viewport=SIZE)
-    if not fresh:
-        page.add_init_script("localStorage.setItem('flexdt-welcome', 'seen')")
     page.set_default_timeout(PATIENCE_MS)
     page.goto(f"{url}?view={view}&tab={tab}&theme=light&light=fine&patience=60")
     page.wait_for_function("window.flexdt?.store.image && flexdt.store.session")
@@ -75,7 +73,7 @@ def taken(page: Any, path: Path) -> None:
 
 
 def first(browser: Any, url: str, to: Path) -> None:
-    page = opened(browser, url, "iso", "move", fresh=True)
+    page = opened(browser, url, "iso", "move")
     page.evaluate("flexdt.call('tube.set', {on: true})")
     page.locator("#beam", has_text="ON").wait_for()
     taken(page, to / "viewer-first.png")

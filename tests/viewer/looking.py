@@ -17,10 +17,9 @@ from flexdt.protocol.state_model import State
 
 Picture = npt.NDArray[np.float32]
 KNOWN_HERE = """
-localStorage.setItem('flexdt-welcome', 'seen');
 if (!localStorage.getItem('flexdt-motors')) localStorage.setItem('flexdt-motors', 'open');
 """
-"""A browser that has been here before: no card for first visits, motors open."""
+"""A browser that has been here before: motors open."""
 
 USUAL = {"mode": "HW2SW1High", "roi": (32, 8, 1943, 1527)}
 """The camera that most tests expect."""

@@ -159,8 +159,9 @@ def with_handles(scene: Any, twin: TwinClient, wait: Wait, view: str) -> Any:
     box = show(scene, view)
     scene.click("#tabs [data-tab=move]")
     scene.check("#handles")
-    scene.mouse.move(1, 1)
     seen(scene, twin)
+    box.locator(".home").click()  # the preset of the machine as it stands now
+    scene.mouse.move(1, 1)
     still(box)
     return box
 

@@ -1,5 +1,5 @@
 """The controls of a task: distances, magnification, voxel and height by their names, what terms
-mean, the film's gamma, and a first visit's three clicks to a volume."""
+mean, the film's gamma, and one click to a volume."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from flexdt.clients.client.client import TwinClient
-from tests.viewer.looking import until
+from tests.viewer.looking import picture, until
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]
@@ -123,15 +123,12 @@ def test_a_telephone_shows_the_tabs_at_once(open_page: Callable[..., Any]) -> No
 
 
 @pytest.mark.parametrize("size", [(320, 568), (390, 844), (800, 600)])
-def test_a_small_screen_offers_one_way_to_a_volume_at_a_time(
+def test_a_small_screen_shows_the_button_and_its_sample_beside_each_other(
     open_page: Callable[..., Any], size: tuple[int, int]
 ) -> None:
     page = open_page(size=size, fresh=True)
-    assert page.locator("#welcome").is_visible()
-    assert not page.locator("#volume-path").is_visible()
-    page.click("#welcome-no")
-    page.locator("#path-scan").scroll_into_view_if_needed()
-    boxes = [page.locator(f"#path-{part}").bounding_box() for part in ("sample", "quality", "scan")]
+    page.locator("#scan-it").scroll_into_view_if_needed()
+    boxes = [page.locator(name).bounding_box() for name in ("#scan-it", "#scan-it-sample")]
     for k, a in enumerate(boxes):
         assert a["x"] >= 0.0
         assert a["x"] + a["width"] <= size[0]
@@ -141,34 +138,32 @@ def test_a_small_screen_offers_one_way_to_a_volume_at_a_time(
     page.close()
 
 
-def test_three_clicks_of_a_first_visit_end_with_a_volume(
+def test_one_click_ends_with_a_volume_beside_its_truth(
     open_page: Callable[..., Any], twin: TwinClient
 ) -> None:
+    """Of what stands on the stage, and nothing else is put there."""
     twin.control("force")
     twin.set_camera(mode="HW4SW1High")
+    twin.set_sample("small-3")
     twin.control("release")
     page = open_page(fresh=True)
-    go = page.locator("#welcome-go")
-    for _ in range(3):
-        until(lambda: go.is_enabled(), "the next step", 240)
-        go.click()
-    page.locator("#welcome").wait_for(state="hidden")
-    page.locator("#volume-card").wait_for()
-    slices = "[...document.querySelectorAll('#volume-card canvas')]"
-    there = f"{slices}.some((c) => c.offsetWidth && c.width > 32)"
-    until(lambda: page.evaluate(there), "slices of the scan", 240)
-    page.reload()
-    page.wait_for_function("window.flexdt?.store.state")
-    assert not page.locator("#welcome").is_visible()
-    page.close()
-
-
-def test_the_card_of_a_first_visit_is_dismissed_for_good(open_page: Callable[..., Any]) -> None:
-    page = open_page(fresh=True)
-    assert page.locator("#welcome").is_visible()
-    page.click("#welcome-no")
-    assert not page.locator("#welcome").is_visible()
-    page.reload()
-    page.wait_for_function("window.flexdt?.store.state")
-    assert not page.locator("#welcome").is_visible()
+    page.wait_for_function("document.querySelector('#scan-it-sample').value === 'small-3'")
+    assert page.locator("button.primary:visible", has_text="Scan").count() == 1
+    page.click("#scan-it")
+    page.locator("#volume-beside").wait_for(timeout=600_000)
+    assert twin.state().sample.name == "small-3"
+    top = page.locator("#slice-top")
+    page.evaluate("flexdt.volume().three.go([0, 0, 20])")
+    seen = {}
+    for share in (0, 1000):
+        page.evaluate(
+            "v => { const s = document.querySelector('#volume-split'); s.value = v;"
+            " s.dispatchEvent(new Event('input')); }",
+            share,
+        )
+        page.wait_for_timeout(300)
+        seen[share] = picture(top)
+    noise = {share: float(np.abs(np.diff(one[8:40, 8:90, 0], axis=1)).mean())
+             for share, one in seen.items()}  # fmt: skip
+    assert noise[0] < 0.2 < noise[1], "the truth has no noise in air, the scan has"
     page.close()

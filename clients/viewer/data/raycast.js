@@ -5,9 +5,14 @@ const VERTEX = "#version 300 es\nin vec2 a; out vec2 at; void main() { at = a; g
 // face as grey values. Steps are of a voxel; a surface is found between two of them.
 const FRAGMENT = `#version 300 es
 precision highp float; precision highp sampler3D;
-uniform sampler3D whole, bricks; uniform vec3 side, count, grid, low, high, right, up, ahead; uniform vec2 room, grey; uniform float level; uniform int cut, most;
+uniform sampler3D whole, bricks, other, otherBricks; uniform float split; uniform vec3 side, count, grid, low, high, right, up, ahead; uniform vec2 room, grey; uniform float level; uniform int cut, most;
 in vec2 at; out vec4 color;
-float value(vec3 p) { return texture(whole, p).r; }
+bool beside() { return at.x > split; }
+float value(vec3 p) { return beside() ? texture(other, p).r : texture(whole, p).r; }
+float most_of(vec3 p) {
+  ivec3 q = min(ivec3(p * grid), textureSize(bricks, 0) - 1);
+  return beside() ? texelFetch(otherBricks, q, 0).r : texelFetch(bricks, q, 0).r;
+}
 void main() {
   vec3 from = (right * at.x * room.x + up * at.y * room.y - 2. * ahead) / side + .5, way = ahead / side;
   vec3 one = 1. / (way + vec3(equal(way, vec3(0.))) * 1e-9), a = (low - from) * one, b = (high - from) * one, first = min(a, b), last = max(a, b);
@@ -18,7 +23,7 @@ void main() {
   if (face) { float v = value(from + way * d); if (v >= level && most == 0) { color = vec4(vec3(clamp((v - grey.x) * grey.y, .06, 1.)) * vec3(1., .96, .9), 1.); return; } }
   for (int i = 0; i < 1500 && d < far; i++) {
     vec3 p = from + way * d;
-    if (texelFetch(bricks, min(ivec3(p * grid), textureSize(bricks, 0) - 1), 0).r < (most == 1 ? max(found, 1e-3) : level)) {
+    if (most_of(p) < (most == 1 ? max(found, 1e-3) : level)) {
       vec3 e = ((floor(p * grid) + vec3(greaterThan(way, vec3(0.)))) / grid - p) * one;
       d += max(min(min(e.x, e.y), e.z), 0.) + step * .2; before = 0.; continue;
     }
@@ -29,7 +34,7 @@ void main() {
       vec3 h = 1.2 / count, n = vec3(value(p + vec3(h.x, 0., 0.)) - value(p - vec3(h.x, 0., 0.)), value(p + vec3(0., h.y, 0.)) - value(p - vec3(0., h.y, 0.)), value(p + vec3(0., 0., h.z)) - value(p - vec3(0., 0., h.z)));
       n = -n / (length(n) + 1e-6);
       float light = max(dot(n, normalize(-ahead + .5 * up - .3 * right)), 0.);
-      color = vec4(vec3(.86, .84, .8) * (.22 + .78 * light) + .25 * pow(light, 24.), 1.); return;
+      color = vec4((beside() ? vec3(.62, .78, .9) : vec3(.9, .86, .78)) * (.22 + .78 * light) + .25 * pow(light, 24.), 1.); return;
     }
     before = v; d += step;
   }
@@ -59,8 +64,7 @@ export function raycast(canvas, side = 0) {
     gl.bindAttribLocation(program, 0, "a");
     gl.vertexAttribPointer(gl.getAttribLocation(program, "a"), 2, gl.FLOAT, false, 0, 0);
     const place = (name) => gl.getUniformLocation(program, name);
-    gl.uniform1i(place("whole"), 0);
-    gl.uniform1i(place("bricks"), 1);
+    ["whole", "bricks", "other", "otherBricks"].forEach((name, unit) => { gl.uniform1i(place(name), unit); });
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
     function texture(unit, [nx, ny, nz], data, filter) {
         if (!gl)
@@ -74,48 +78,22 @@ export function raycast(canvas, side = 0) {
             gl.texParameteri(gl.TEXTURE_3D, name, filter);
         gl.texImage3D(gl.TEXTURE_3D, 0, gl.R8, nx, ny, nz, 0, gl.RED, gl.UNSIGNED_BYTE, data);
     }
-    const one = new Uint8Array(4), held = [null, null];
-    let block = null, due = false, seen = [0, 1], spot = [0, 0, 0], scale = 1, resting, held_down = false;
+    const one = new Uint8Array(4), held = [null, null, null, null];
+    let block = null, twin = null, due = false, seen = [0, 1], spot = [0, 0, 0], scale = 1, resting, held_down = false;
     const me = {
-        yaw: 0.5, pitch: 0.4, zoom: 1, level: 0.5, most: false, cut: -1, ms: 0, software,
+        yaw: 0.5, pitch: 0.4, zoom: 1, level: 0.5, most: false, cut: -1, ms: 0, software, split: 1,
         // 8 bits between the ends of the block's window, and half as much again beyond; the rest of the work is the shader's.
         show(b) {
             block = b;
             if (!b)
                 return;
-            const size = extent(b), f = Math.max(1, Math.ceil(Math.max(...size) / largest)), n = size.map((v) => Math.max(1, Math.floor(v / f)));
-            const [lo, hi] = ends(b).map((v) => codeOf(b, v)), data = new Uint8Array(n[0] * n[1] * n[2]), grid = n.map((v) => Math.ceil(v / BRICK)), bricks = new Uint8Array(grid[0] * grid[1] * grid[2]);
-            const put = (x, y, z, v) => { const k = (z * grid[1] + y) * grid[0] + x; if (v > bricks[k])
-                bricks[k] = v; };
-            for (let z = 0, o = 0; z < n[2]; z++)
-                for (let y = 0; y < n[1]; y++)
-                    for (let x = 0; x < n[0]; x++, o++) {
-                        let sum = 0, known = 0;
-                        for (let c = 0; c < f; c++)
-                            for (let r = 0; r < f; r++)
-                                for (let k = 0, at = ((z * f + c) * size[1] + y * f + r) * size[0] + x * f; k < f; k++, at++)
-                                    if (b.codes[at]) {
-                                        sum += b.codes[at];
-                                        known++;
-                                    }
-                        const v = known ? 1 + Math.min(254, Math.max(0, (254 * (sum / known - lo)) / (hi - lo))) : 0;
-                        data[o] = v;
-                        // What lies at the edge of a brick is seen from the next one, too.
-                        const [i, j, l] = [x, y, z].map((q) => Math.floor(q / BRICK));
-                        put(i, j, l, v);
-                        for (const [at, step] of [[x, 0], [y, 1], [z, 2]]) {
-                            const edge = at % BRICK === 0 ? -1 : at % BRICK === BRICK - 1 ? 1 : 0, to = [i, j, l];
-                            to[step] += edge;
-                            if (edge && to[step] >= 0 && to[step] < grid[step])
-                                put(to[0], to[1], to[2], v);
-                        }
-                    }
-            texture(0, n, data, gl.LINEAR);
-            texture(1, grid, bricks, gl.NEAREST);
-            gl.uniform3fv(place("count"), n);
-            gl.uniform3fv(place("grid"), n.map((v) => v / BRICK));
+            fill(b, ends(b), 0);
+            if (!twin)
+                fill(b, ends(b), 2);
             me.draw();
         },
+        beside(b) { twin = b; if (b && block)
+            fill(b, ends(block), 2); me.draw(); },
         window(window) { seen = window; me.draw(); },
         cross(at) { spot = at; if (me.cut >= 0)
             me.draw(); },
@@ -124,6 +102,41 @@ export function raycast(canvas, side = 0) {
             requestAnimationFrame(() => { due = false; paint(); });
         } },
     };
+    function fill(b, range, unit) {
+        if (!gl)
+            return;
+        const size = extent(b), f = Math.max(1, Math.ceil(Math.max(...size) / largest)), n = size.map((v) => Math.max(1, Math.floor(v / f)));
+        const [lo, hi] = range.map((v) => codeOf(b, v)), data = new Uint8Array(n[0] * n[1] * n[2]), grid = n.map((v) => Math.ceil(v / BRICK)), bricks = new Uint8Array(grid[0] * grid[1] * grid[2]);
+        const put = (x, y, z, v) => { const k = (z * grid[1] + y) * grid[0] + x; if (v > bricks[k])
+            bricks[k] = v; };
+        for (let z = 0, o = 0; z < n[2]; z++)
+            for (let y = 0; y < n[1]; y++)
+                for (let x = 0; x < n[0]; x++, o++) {
+                    let sum = 0, known = 0;
+                    for (let c = 0; c < f; c++)
+                        for (let r = 0; r < f; r++)
+                            for (let k = 0, at = ((z * f + c) * size[1] + y * f + r) * size[0] + x * f; k < f; k++, at++)
+                                if (b.codes[at]) {
+                                    sum += b.codes[at];
+                                    known++;
+                                }
+                    const v = known ? 1 + Math.min(254, Math.max(0, (254 * (sum / known - lo)) / (hi - lo))) : 0;
+                    data[o] = v;
+                    // What lies at the edge of a brick is seen from the next one, too.
+                    const [i, j, l] = [x, y, z].map((q) => Math.floor(q / BRICK));
+                    put(i, j, l, v);
+                    for (const [at, step] of [[x, 0], [y, 1], [z, 2]]) {
+                        const edge = at % BRICK === 0 ? -1 : at % BRICK === BRICK - 1 ? 1 : 0, to = [i, j, l];
+                        to[step] += edge;
+                        if (edge && to[step] >= 0 && to[step] < grid[step])
+                            put(to[0], to[1], to[2], v);
+                    }
+                }
+        texture(unit, n, data, gl.LINEAR);
+        texture(unit + 1, grid, bricks, gl.NEAREST);
+        gl.uniform3fv(place("count"), n);
+        gl.uniform3fv(place("grid"), n.map((v) => v / BRICK));
+    }
     const ends = (b) => [b.window[0], b.window[1] + 0.5 * (b.window[1] - b.window[0])];
     const axes = () => {
         const [c, s, p, q] = [Math.cos(me.yaw), Math.sin(me.yaw), Math.cos(me.pitch), Math.sin(me.pitch)];
@@ -150,6 +163,7 @@ export function raycast(canvas, side = 0) {
             gl.uniform3fv(place(name), v);
         gl.uniform2fv(place("room"), room);
         gl.uniform2f(place("grey"), tone(seen[0]), 1 / Math.max(1e-6, tone(seen[1]) - tone(seen[0])));
+        gl.uniform1f(place("split"), twin ? 2 * me.split - 1 : 2);
         gl.uniform1f(place("level"), Math.max(tone(me.level), 2 / 255));
         gl.uniform1i(place("cut"), me.cut);
         gl.uniform1i(place("most"), me.most ? 1 : 0);
@@ -160,6 +174,10 @@ export function raycast(canvas, side = 0) {
         x.fillRect(0, 0, w, h);
         x.imageSmoothingEnabled = true;
         x.drawImage(glass, 0, 0, w, h);
+        if (twin) {
+            x.fillStyle = "#36e28f";
+            x.fillRect(me.split * w - unit / 2, 0, unit, h);
+        }
         // The box, its axes' names, the scale.
         const at = (v) => { const p = v.map((q, k) => (q - 0.5) * box[k]), dot = (a) => p[0] * a[0] + p[1] * a[1] + p[2] * a[2]; return [(w / 2) * (1 + dot(right) / room[0]), (h / 2) * (1 - dot(up) / room[1])]; };
         x.lineWidth = unit;

@@ -21,10 +21,10 @@ export function drawBar(x, mm, px, unit) {
 export function signed(g) { const d = 2 * Math.abs(g - 127.5) | 0; return g < 127.5 ? 0xff000000 | (d << 16) | ((d >> 1) << 8) : 0xff000000 | ((d >> 1) << 8) | d; }
 // `pointed` hears of the voxel under the pointer, `moved` of a cross or a profile that was moved.
 export function slices(canvases, pointed, moved) {
-    const table = new Uint32Array(TOP + 2), buffers = {};
+    const table = new Uint32Array(TOP + 2), other = new Uint32Array(TOP + 2), buffers = {};
     let due = false, line = null;
     const me = {
-        block: null, window: [0, 1], cross: [0, 0, 0], profiling: false,
+        block: null, window: [0, 1], cross: [0, 0, 0], profiling: false, beside: null, split: 1,
         show(block, window) {
             const before = me.block, size = block && extent(block);
             if (size && before?.shape.join() !== block.shape.join()) {
@@ -37,14 +37,10 @@ export function slices(canvases, pointed, moved) {
         look(window) {
             const b = me.block;
             me.window = window;
-            if (b) {
-                const from = codeOf(b, window[0]), step = 255 / Math.max(1e-9, codeOf(b, window[1]) - from);
-                for (let k = 1; k < table.length; k++) {
-                    const g = Math.min(255, Math.max(0, (k - from) * step)) | 0;
-                    table[k] = b.signed ? signed(g) : 0xff000000 | (g * 0x010101);
-                }
-                table[0] = UNKNOWN;
-            }
+            if (b)
+                fill(table, b, window);
+            if (me.beside)
+                fill(other, me.beside, window);
             me.draw();
         },
         go(cross) {
@@ -80,6 +76,15 @@ export function slices(canvases, pointed, moved) {
             return { values, mm: length * b.voxel_mm };
         },
     };
+    // Colours of a block's codes.
+    function fill(colors, b, window) {
+        const from = codeOf(b, window[0]), step = 255 / Math.max(1e-9, codeOf(b, window[1]) - from);
+        for (let k = 1; k < colors.length; k++) {
+            const g = Math.min(255, Math.max(0, (k - from) * step)) | 0;
+            colors[k] = b.signed ? signed(g) : 0xff000000 | (g * 0x010101);
+        }
+        colors[0] = UNKNOWN;
+    }
     // The voxel of a place in a picture (voxels to the right, and up).
     function place(side, [right, up]) {
         const [i, j] = AXES[side], at = [...me.cross], size = me.block ? extent(me.block) : [1, 1, 1];
@@ -101,9 +106,13 @@ export function slices(canvases, pointed, moved) {
         if (!inside || !out)
             return;
         const data = new Uint32Array(out.data.buffer), start = me.cross[k] * strides[k];
-        for (let r = 0, o = 0; r < h; r++)
-            for (let c = 0, at = start + (h - 1 - r) * strides[j]; c < w; c++, o++, at += strides[i])
-                data[o] = table[b.codes[at]];
+        const far = !b.own && me.beside?.shape.join() === b.shape.join() ? me.beside : null, cut = far ? Math.round(me.split * w) : w;
+        for (let r = 0, o = 0; r < h; r++) {
+            let at = start + (h - 1 - r) * strides[j];
+            for (let c = 0; c < w; c++, o++, at += strides[i]) {
+                data[o] = far && c >= cut ? other[far.codes[at]] : table[b.codes[at]];
+            }
+        }
         inside.putImageData(out, 0, 0);
         const unit = Math.min(devicePixelRatio, 2), wide = Math.round(canvas.clientWidth * unit), high = Math.round((wide * h) / w), s = wide / w;
         if (canvas.width !== wide || canvas.height !== high) {
@@ -121,6 +130,10 @@ export function slices(canvases, pointed, moved) {
         x.moveTo(0, cy);
         x.lineTo(wide, cy);
         x.stroke();
+        if (far) {
+            x.fillStyle = LINE;
+            x.fillRect(cut * s - unit / 2, 0, unit, high);
+        }
         if (line?.side === side) {
             x.strokeStyle = LINE;
             x.lineWidth = 1.5 * unit;

@@ -6,6 +6,7 @@ import { folder } from "./data.js";
 import { extent, index, slices, valueOf } from "./slices.js";
 import { raycast } from "./raycast.js";
 import { shared } from "./shared.js";
+import { otsu } from "./otsu.js";
 const KEY = "flexdt-volume", STARTING = "starting; dark, flat and a first image are needed", EXACT_MS = 60;
 const SHOWN = { volume: "volume", sigma: "noise (standard deviation)", bias_bound: "bound of the bias", other: "the other geometry", truth: "truth of the sample", difference: "volume − truth" };
 const size = $select("#volume-side"), note = $("#volume-note"), progress = $("#volume-progress"), shown = $select("#volume-shown");
@@ -49,6 +50,9 @@ function forget() {
     blocks.clear();
     three.show(null);
     kept = null;
+    three.beside = null;
+    solid?.beside(null);
+    $("#volume-beside").hidden = true;
     for (const id of [".slices", "#volume-tools", "#volume-large"])
         $(id).hidden = true;
     $("#volume-compared").textContent = "";
@@ -108,11 +112,48 @@ on("volume", (m) => {
         void want();
     if (m.compared)
         compared(m.compared);
+    if (m.compared && m.volumes?.includes("truth"))
+        void beside();
     $button("#volume-compare").disabled = !m.past || m.comparing !== undefined;
     if (thenCompare && m.past && m.done === 1 && m.comparing === undefined && !comparing)
         compare();
 });
+// The truth beside the scan, under one slider.
+const splitter = $input("#volume-split");
+async function beside() {
+    if (three.beside || !past)
+        return;
+    const mine = asked;
+    const truth = await fetched("truth");
+    if (!truth || mine !== asked || three.beside)
+        return;
+    blocks.set("truth", truth);
+    three.beside = truth;
+    three.look(three.window);
+    solid?.beside(truth);
+    $("#volume-beside").hidden = false;
+    parted();
+}
+function parted() {
+    three.split = splitter.valueAsNumber / 1000;
+    three.draw();
+    if (!solid)
+        return;
+    solid.split = three.split;
+    solid.draw();
+}
+splitter.addEventListener("input", parted);
 function compare() { comparing = true; $button("#volume-compare").disabled = true; void call("viewer.compare", of).catch((error) => setText(note, words(error))); }
+async function fetched(name) {
+    const head = await call("viewer.block", { ...of, what: name }).catch(() => null);
+    const raw = head?.url ? await fetch(head.url).then((r) => r.arrayBuffer(), () => null) : null;
+    if (!head?.shape || !raw || !told)
+        return null;
+    if (raw.byteLength !== 2 * head.shape.reduce((a, n) => a * n))
+        return null;
+    const voxel_mm = (told.voxel_mm ?? 0) * (head.factor ?? 1);
+    return { ...head, codes: new Uint16Array(raw), voxel_mm };
+}
 // The volume that is chosen, once; of one that grows the newest, one at a time: what is told meanwhile is fetched afterwards.
 async function want() {
     if (wanting) {
@@ -124,9 +165,7 @@ async function want() {
     const mine = asked, name = shown.value;
     let block = blocks.get(name) ?? null;
     if (!block) {
-        const head = await call("viewer.block", { ...of, what: name }).catch(() => null), raw = head?.url ? await fetch(head.url).then((r) => r.arrayBuffer(), () => null) : null;
-        if (head?.shape && raw && raw.byteLength === 2 * head.shape.reduce((a, n) => a * n) && told)
-            block = { ...head, codes: new Uint16Array(raw), voxel_mm: (told.voxel_mm ?? 0) * (head.factor ?? 1) };
+        block = await fetched(name);
         if (block && name === "difference") {
             const end = Math.max(...(blocks.get("volume")?.window ?? [0, 1])) / 2;
             block.signed = true;
@@ -178,8 +217,15 @@ function seen() { if (!three.block?.own) {
     kept = three.window;
     solid?.window(kept);
 } drawHistogram(); drawProfile(); point(pointer); }
-function surface() { if (!three.block)
-    return; level.value = String(part(three.block.window[1] / 2)); turned(); }
+// The surface begins at Otsu's threshold of all that is shown.
+function surface() {
+    if (!three.block)
+        return;
+    const [low, high] = range();
+    const counts = three.histogram([low, high]);
+    level.value = String(part(low + ((high - low) * otsu(counts)) / counts.length));
+    turned();
+}
 function turned() { if (!solid)
     return; solid.level = value(level.valueAsNumber); solid.cut = Number($select("#volume-cut").value); solid.most = $select("#volume-way").value === "most"; solid.cross(three.cross); solid.draw(); drawHistogram(); }
 for (const end of ends)

@@ -24,15 +24,17 @@ export function signed(g: number) { const d = 2 * Math.abs(g - 127.5) | 0; retur
 
 export interface Slices {
   block: Block | null; window: Pair; cross: Vector; profiling: boolean;
+  // Another volume of the same shape, which pictures show to the right of a part of their width.
+  beside: Block | null; split: number;
   show(block: Block | null, window?: Pair): void; look(window: Pair): void; go(cross: Vector): void; draw(): void;
   histogram(range: Pair): Float64Array; profile(): { values: number[]; mm: number } | null;
 }
 // `pointed` hears of the voxel under the pointer, `moved` of a cross or a profile that was moved.
 export function slices(canvases: Record<Side, HTMLCanvasElement>, pointed: (place: Vector | null) => void, moved: () => void): Slices {
-  const table = new Uint32Array(TOP + 2), buffers = {} as Record<Side, HTMLCanvasElement>;
+  const table = new Uint32Array(TOP + 2), other = new Uint32Array(TOP + 2), buffers = {} as Record<Side, HTMLCanvasElement>;
   let due = false, line: { side: Side; from: Pair; to: Pair } | null = null;
   const me: Slices = {
-    block: null, window: [0, 1], cross: [0, 0, 0], profiling: false,
+    block: null, window: [0, 1], cross: [0, 0, 0], profiling: false, beside: null, split: 1,
     show(block, window) {
       const before = me.block, size = block && extent(block);
       if (size && before?.shape.join() !== block.shape.join()) { me.cross = size.map((n) => n >> 1) as Vector; line = null; }
@@ -42,11 +44,8 @@ export function slices(canvases: Record<Side, HTMLCanvasElement>, pointed: (plac
     look(window) {
       const b = me.block;
       me.window = window;
-      if (b) {
-        const from = codeOf(b, window[0]), step = 255 / Math.max(1e-9, codeOf(b, window[1]) - from);
-        for (let k = 1; k < table.length; k++) { const g = Math.min(255, Math.max(0, (k - from) * step)) | 0; table[k] = b.signed ? signed(g) : 0xff000000 | (g * 0x010101); }
-        table[0] = UNKNOWN;
-      }
+      if (b) fill(table, b, window);
+      if (me.beside) fill(other, me.beside, window);
       me.draw();
     },
     go(cross) {
@@ -71,6 +70,15 @@ export function slices(canvases: Record<Side, HTMLCanvasElement>, pointed: (plac
       return { values, mm: length * b.voxel_mm };
     },
   };
+  // Colours of a block's codes.
+  function fill(colors: Uint32Array, b: Block, window: Pair) {
+    const from = codeOf(b, window[0]), step = 255 / Math.max(1e-9, codeOf(b, window[1]) - from);
+    for (let k = 1; k < colors.length; k++) {
+      const g = Math.min(255, Math.max(0, (k - from) * step)) | 0;
+      colors[k] = b.signed ? signed(g) : 0xff000000 | (g * 0x010101);
+    }
+    colors[0] = UNKNOWN;
+  }
   // The voxel of a place in a picture (voxels to the right, and up).
   function place(side: Side, [right, up]: Pair): Vector {
     const [i, j] = AXES[side], at: Vector = [...me.cross], size = me.block ? extent(me.block) : [1, 1, 1];
@@ -85,7 +93,13 @@ export function slices(canvases: Record<Side, HTMLCanvasElement>, pointed: (plac
     const inside = buffer.getContext("2d"), strides = [1, size[0], size[0] * size[1]], out = inside?.createImageData(w, h);
     if (!inside || !out) return;
     const data = new Uint32Array(out.data.buffer), start = me.cross[k] * strides[k];
-    for (let r = 0, o = 0; r < h; r++) for (let c = 0, at = start + (h - 1 - r) * strides[j]; c < w; c++, o++, at += strides[i]) data[o] = table[b.codes[at]];
+    const far = !b.own && me.beside?.shape.join() === b.shape.join() ? me.beside : null, cut = far ? Math.round(me.split * w) : w;
+    for (let r = 0, o = 0; r < h; r++) {
+      let at = start + (h - 1 - r) * strides[j];
+      for (let c = 0; c < w; c++, o++, at += strides[i]) {
+        data[o] = far && c >= cut ? other[far.codes[at]] : table[b.codes[at]];
+      }
+    }
     inside.putImageData(out, 0, 0);
     const unit = Math.min(devicePixelRatio, 2), wide = Math.round(canvas.clientWidth * unit), high = Math.round((wide * h) / w), s = wide / w;
     if (canvas.width !== wide || canvas.height !== high) { canvas.width = wide; canvas.height = high; }
@@ -93,6 +107,7 @@ export function slices(canvases: Record<Side, HTMLCanvasElement>, pointed: (plac
     x.drawImage(buffer, 0, 0, wide, high);
     const [cx, cy] = [(me.cross[i] + 0.5) * s, high - (me.cross[j] + 0.5) * s];
     x.strokeStyle = CROSS; x.lineWidth = unit; x.beginPath(); x.moveTo(cx, 0); x.lineTo(cx, high); x.moveTo(0, cy); x.lineTo(wide, cy); x.stroke();
+    if (far) { x.fillStyle = LINE; x.fillRect(cut * s - unit / 2, 0, unit, high); }
     if (line?.side === side) {
       x.strokeStyle = LINE; x.lineWidth = 1.5 * unit; x.beginPath();
       for (const [r, u] of [line.from, line.to]) x.lineTo((r + 0.5) * s, high - (u + 0.5) * s);

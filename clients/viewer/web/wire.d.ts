@@ -221,6 +221,7 @@ export type Window = { low?: number | null; high?: number | null };
 // Method -> its parameters, and its answer where the wire names one.
 export interface Methods {
   "session.control": [Control, ControlResult];
+  "state.get": [Empty, State];
   "axes.move": [Move, MoveResult];
   "axes.jog": [Jog, MoveResult];
   "axes.stop": [Empty, Stopped];

@@ -1,0 +1,110 @@
+// "Scan it": one turn of what stands on the stage. The sample fills the image, the views follow from its size, the
+// volume grows in the scene meanwhile and then stands beside its truth.
+import { $, $button, $select, clicks, el, setText } from "./dom.js";
+import { command, call, emit, on, store } from "./link.js";
+import { folder } from "./data.js";
+import { reconstruct, watch } from "./volume.js";
+import type { Answers, State } from "./viewer.js";
+
+const LEAST_VIEWS = 91;
+const MOST_VIEWS = 151;
+const EXPOSURE_MS = 100;
+// Voxels across the image of the volume that is shown.
+const SHOWN_VOXELS = 256;
+// Part of the image, in width and height, that the sample takes.
+const FILL = 0.8;
+// Change of the voxel size below which the stage stays where it is.
+const SAME = 0.12;
+const sample = $select("#scan-it-sample");
+const go = $button("#scan-it");
+const note = $("#scan-it-note");
+let mine: string | null = null;
+// From the press of the button until the volume stands beside its truth.
+let busy = false;
+
+// Size of what turns, across and upright, in mm; null where nobody has said it.
+function turning({ sample: { size_mm: size } }: State): [across: number, upright: number] | null {
+  return size ? [Math.hypot(size[0], size[1]), size[2]] : null;
+}
+// The voxel size [um] at which the sample fills the image.
+export function filling(state: State): number | null {
+  const size = turning(state);
+  const [rows, columns] = state.camera.shape;
+  if (!size) return null;
+  return (1000 * Math.max(size[0] / columns, size[1] / rows)) / FILL;
+}
+// As many views as keep steps at the rim of the sample within a voxel of what is shown.
+export function viewsFor(state: State, voxel_um: number): number {
+  const size = turning(state);
+  const shown_mm = (voxel_um / 1000) * Math.max(1, state.camera.shape[1] / SHOWN_VOXELS);
+  const wanted = size ? Math.ceil((Math.PI / 2) * (size[0] / shown_mm)) : MOST_VIEWS;
+  return Math.min(MOST_VIEWS, Math.max(LEAST_VIEWS, wanted)) | 1;
+}
+// A script for it: nearer or farther where that is possible, else where the stage stands.
+async function script(state: State): Promise<Answers["viewer.compose"] | null> {
+  const now_um = 1000 * (state.geometry.voxel_size_mm ?? 0.1);
+  const wanted_um = filling(state);
+  const near = wanted_um !== null && Math.abs(wanted_um / now_um - 1) > SAME ? wanted_um : null;
+  for (const voxel_um of near === null ? [null] : [near, null]) {
+    const frames = viewsFor(state, voxel_um ?? now_um);
+    const asked = { kind: "fly" as const, frames, exposure_ms: EXPOSURE_MS };
+    const more = voxel_um === null ? {} : { voxel_um };
+    const made = await call("viewer.compose", { ...asked, ...more }).catch(() => null);
+    const found = made && (await call("script.check", { text: made.text }).catch(() => null));
+    if (found?.ok) return made;
+  }
+  return command("viewer.compose", { kind: "fly", frames: LEAST_VIEWS, exposure_ms: EXPOSURE_MS }, "No scan");
+}
+export async function scanIt(): Promise<void> {
+  go.disabled = true;
+  try {
+    const other = sample.value && sample.value !== store.state?.sample.name;
+    if (other && !(await command("sample.set", { name: sample.value }, "The sample stays"))) return;
+    const state = await call("state.get").catch(() => null);
+    const made = state && (await script(state));
+    const asked = made && { text: made.text, speed_up: "max" as const };
+    const job = asked && (await command("script.submit", asked, "No scan"));
+    if (!job) return;
+    mine = job.job;
+    busy = true;
+    watch();
+    emit("note", "good", "Scan it", `${sample.value || "the sample"}: ${job.job} has begun`);
+  } finally {
+    go.disabled = false;
+  }
+}
+
+on("state", (state) => {
+  const offered = [...$select("#sample").options].map((option) => option.value);
+  const names = [...new Set([state.sample.name ?? "", ...offered])].filter(Boolean);
+  const key = names.join("\n");
+  if (!busy) setText(note, told(state));
+  if (sample.dataset.names === key || document.activeElement === sample) return;
+  sample.dataset.names = key;
+  sample.replaceChildren(...names.map((name) => el("option", { value: name }, name)));
+});
+function told(state: State): string {
+  const voxel_um = filling(state);
+  if (!state.sample.name || voxel_um === null) return "The stage is empty: choose a sample.";
+  const views = viewsFor(state, voxel_um);
+  return `One turn, ${views} images; its volume grows in the scene.`;
+}
+on("job", (job) => {
+  if (job.job !== mine) return;
+  if (job.state === "done") {
+    setText(note, "Reconstructing all of it, beside its truth.");
+    mine = null;
+    reconstruct(folder(job), true);
+    return;
+  }
+  setText(note, `${job.frames_done} of ${job.frames_total} images`);
+  if (["failed", "aborted", "incomplete"].includes(job.state)) {
+    mine = null;
+    busy = false;
+  }
+});
+on("volume", (volume) => {
+  if (busy && mine === null && (volume.compared || volume.not_compared || volume.problem)) busy = false;
+});
+clicks({ "scan-it": scanIt });
+sample.addEventListener("change", () => setText(note, `${sample.value} is put on the stage first.`));
