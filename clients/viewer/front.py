@@ -32,7 +32,7 @@ from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
 from flexdt.clients.viewer.browser_connections import Admission, BrowserConnection
-from flexdt.clients.viewer.page_html import PAGE, TRANSLUCENT, page_file
+from flexdt.clients.viewer.page_html import PAGE, TRANSLUCENT, page_file, token_form
 from flexdt.clients.viewer.page_messages import MessageFilter
 from flexdt.clients.viewer.viser_gate import MARK, parted
 from flexdt.runtime.access import check_bind, is_loopback, is_rebound, token_matches
@@ -57,6 +57,7 @@ SCENE_PATH: Final = re.compile(r"/scene/([0-9a-f]{8,64})/([a-z]{1,16})")
 DOWNLOAD_PATH: Final = re.compile(r"/download/([0-9a-f]{32})")
 FOR_GOOD: Final = "private, max-age=31536000, immutable"
 """Of what changes its name with its content."""
+NO_TOKEN: Final = "This viewer wants a token: open its first page, and type it there.\n"
 POLICY: Final = (
     "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; connect-src 'self' data: blob: "
     "ws: wss:; frame-ancestors 'self'"
@@ -242,10 +243,10 @@ class Front:
             with contextlib.suppress(TimeoutError):
                 async with self._guessing, asyncio.timeout(GUESS_S):
                     await self._closing.wait()
-        return _plain(
-            http.HTTPStatus.UNAUTHORIZED,
-            "This viewer wants a token: open the address once with ?token=TOKEN behind it.",
-        )
+        wrong = given is not None
+        asked = token_form(wrong) if url.path == "/" else NO_TOKEN.encode()
+        form = "text/html" if url.path == "/" else "text/plain"
+        return _response(asked, f"{form}; charset=utf-8", status=http.HTTPStatus.UNAUTHORIZED)
 
     # -- WebSockets --------------------------------------------------------------------------
 

@@ -11,6 +11,9 @@ from flexdt.clients.viewer.scenes.layers import LAYERS, Layer
 PAGE: Final = "index.html"
 TRANSLUCENT: Final = "translucent.js"
 """What every scene of viser loads first, on the page and exported."""
+TOKEN_FORM: Final = "token.html"
+WRONG: Final = "<!-- wrong -->"
+"""Where the form says that a token was wrong."""
 PLACE: Final = "<!-- a box for each layer -->"
 """Where the boxes stand."""
 
@@ -23,6 +26,16 @@ def page_file(name: str) -> bytes:
     """
     content = (resources.files("flexdt.clients.viewer") / "data" / name).read_bytes()
     return content.replace(PLACE.encode(), boxes(LAYERS).encode(), 1) if name == PAGE else content
+
+
+def token_form(wrong: bool) -> bytes:
+    """Make the page that asks for the viewer's token.
+
+    Args:
+        wrong: whether one was given that is not it.
+    """
+    said = b'<p id="wrong" role="alert">This is not it.</p>' if wrong else b""
+    return page_file(TOKEN_FORM).replace(WRONG.encode(), said, 1)
 
 
 def boxes(layers: tuple[Layer, ...]) -> str:

@@ -176,8 +176,14 @@ def test_foreign_pages_are_refused() -> None:
 
 def test_a_token_is_asked_for_once() -> None:
     async def work(front: Front) -> None:
-        assert (await fetch(front.port, "/"))[0] == 401
-        assert (await fetch(front.port, "/?token=wrong-but-long-enough"))[0] == 401
+        status, headers, asked = await fetch(front.port, "/")
+        assert (status, headers["Content-Type"]) == (401, "text/html; charset=utf-8")
+        assert b'name="token"' in asked
+        assert b"This is not it" not in asked
+        status, _, again = await fetch(front.port, "/?token=wrong-but-long-enough")
+        assert status == 401
+        assert b"This is not it" in again
+        assert (await fetch(front.port, "/main.js"))[1]["Content-Type"].startswith("text/plain")
         url = f"ws://127.0.0.1:{front.port}/ws/{'b' * 12}"
         with pytest.raises(InvalidStatus):
             async with connect(url, proxy=None):

@@ -17,6 +17,7 @@ import "./share.js";
 import "./layout.js";
 import { look as volume } from "./volume.js";
 import "./scan_it.js";
+import "./story.js";
 import { asked } from "./address.js";
 import { listen, toggleHelp } from "./keys.js";
 import { fine, layout } from "./views.js";

@@ -55,20 +55,22 @@ async function script(state: State): Promise<Answers["viewer.compose"] | null> {
   }
   return command("viewer.compose", { kind: "fly", frames: LEAST_VIEWS, exposure_ms: EXPOSURE_MS }, "No scan");
 }
-export async function scanIt(): Promise<void> {
+// Says whether a scan has begun.
+export async function scanIt(): Promise<boolean> {
   go.disabled = true;
   try {
     const other = sample.value && sample.value !== store.state?.sample.name;
-    if (other && !(await command("sample.set", { name: sample.value }, "The sample stays"))) return;
+    if (other && !(await command("sample.set", { name: sample.value }, "The sample stays"))) return false;
     const state = await call("state.get").catch(() => null);
     const made = state && (await script(state));
     const asked = made && { text: made.text, speed_up: "max" as const };
     const job = asked && (await command("script.submit", asked, "No scan"));
-    if (!job) return;
+    if (!job) return false;
     mine = job.job;
     busy = true;
     watch();
     emit("note", "good", "Scan it", `${sample.value || "the sample"}: ${job.job} has begun`);
+    return true;
   } finally {
     go.disabled = false;
   }
