@@ -25,6 +25,8 @@ pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]
 ROI = [800, 620, 1199, 939]
 LONG = 3000
+STRIP_PX = 44
+"""Height of the strip below a saved radiograph."""
 """Frames of a scan that does not end meanwhile, however late a busy machine comes to look."""
 
 
@@ -500,14 +502,21 @@ def test_starved_and_saturated_pixels_are_marked(page: Any, twin: TwinClient, wa
     page.wait_for_function("flexdt.store.image?.kind === 'line_integral'")
 
 
-def test_the_radiograph_is_saved_as_a_picture(page: Any, tmp_path: Path) -> None:
+def test_the_radiograph_is_saved_as_a_picture(page: Any, twin: TwinClient, tmp_path: Path) -> None:
     page.click("#tabs [data-tab=share]")
     with page.expect_download() as promise:
         page.click("#shot-film")
     promise.value.save_as(tmp_path / "film.png")
     saved = np.asarray(Image.open(tmp_path / "film.png").convert("L"), dtype=float)
-    assert saved.std() > 2.0
-    assert list(saved.shape) == page.evaluate("flexdt.store.image.full")
+    rows, columns = page.evaluate("flexdt.store.image.full")
+    assert saved[:rows].std() > 2.0
+    assert saved.shape == (rows + STRIP_PX, columns)
+    # The scale is as long as it says, at the axis.
+    voxel_mm = twin.state().geometry.voxel_size_mm
+    bar = np.flatnonzero(saved[rows + 29] > 150.0)
+    bar = bar[: np.argmax(np.diff(bar, append=10**6) > 1) + 1]
+    length_mm = len(bar) * voxel_mm
+    assert min(abs(length_mm / (m * 10.0**e) - 1.0) for m in (1, 2, 5) for e in range(-2, 3)) < 0.03
 
 
 def test_predicted_beads_lie_on_the_shadows(page: Any, twin: TwinClient, wait: Wait) -> None:

@@ -1,4 +1,5 @@
 // The Calibrate tab: corrections there are, the one in force, applying and undoing, running a fit.
+import { nextStep } from "./calibrate_next.js";
 import { $, $$, $button, $input, chosen, clicks, el, fixed, words } from "./dom.js";
 import { call, command, emit, on } from "./link.js";
 import { know } from "./compare.js";
@@ -122,9 +123,13 @@ async function estimate(method, params, names, title) {
             void apply(correction, names.join(", ")); } };
     const compared = { id: "fit-compare", class: "small", disabled: !scan, title: "Where the beads were predicted before and after, over the radiographs",
         onclick: () => open(scan, null, true) };
+    const actions = {
+        compare: scan ? () => open(scan, null, true) : null,
+        again: (free) => estimate("calibration.fit", { datasets: names, ...wanted(), free }, names, "No calibration"),
+    };
     const [use, ...why] = (r.verdict ?? (r.identifiable ? "Identifiable" : "Not identifiable")).split(": ");
     const left = (r.outliers ?? []).map((o) => `bead ${o.marker} of frame ${o.frame} (${fixed(o.px ?? 0, 2)} px)`);
-    $("#fit-report").append(el("div", {}, el("span", { class: `verdict ${r.identifiable ? "ok" : "bad"}` }, use), why.length ? `: ${why.join(": ")}` : ""), ...(r.next ?? []).map((line) => el("div", {}, el("span", { class: "muted" }, "next: "), el("code", {}, line))), ...(r.image_space ?? []).map(shown), el("div", { class: "muted" }, figures, left.length ? ` · left out: ${left.slice(0, 3).join(", ")}${left.length > 3 ? ` and ${left.length - 3} more` : ""}` : ""), shown(parameters), ...(r.weak ?? []).map((w) => el("div", { class: "error" }, w)), ...Object.entries(r.refused ?? {}).map(([name, why]) => el("div", { class: "muted" }, `${name}: ${why}`)), ...(r.warnings ?? []).map((w) => el("div", { class: "error" }, w)), el("div", { class: "row", style: "margin-top:7px" }, el("button", applied, "Apply"), r.tracks ? el("button", compared, "Compare over a radiograph") : null));
+    $("#fit-report").append(el("div", {}, el("span", { class: `verdict ${r.identifiable ? "ok" : "bad"}` }, use), why.length ? `: ${why.join(": ")}` : ""), ...(r.next ?? []).map((line) => nextStep(line, actions)), ...(r.image_space ?? []).map(shown), el("div", { class: "muted" }, figures, left.length ? ` · left out: ${left.slice(0, 3).join(", ")}${left.length > 3 ? ` and ${left.length - 3} more` : ""}` : ""), shown(parameters), ...(r.weak ?? []).map((w) => el("div", { class: "error" }, w)), ...Object.entries(r.refused ?? {}).map(([name, why]) => el("div", { class: "muted" }, `${name}: ${why}`)), ...(r.warnings ?? []).map((w) => el("div", { class: "error" }, w)), el("div", { class: "row", style: "margin-top:7px" }, el("button", applied, "Apply"), r.tracks ? el("button", compared, "Compare over a radiograph") : null));
 }
 on("calibrate", async (dataset, sample, markers) => {
     emit("show-tab", "calibrate");

@@ -1,5 +1,6 @@
 // The radiograph: window and level, zoom, the value under the pointer, beads and flags drawn over it, and its
 // difference from a frame that was kept.
+import { below } from "./plot_axes.js";
 import { $, $button, $canvas, $input, $select, bars, cleared, context2d, fixed, setText, slid } from "./dom.js";
 import { call, emit, on, store } from "./link.js";
 import * as measure from "./measure.js";
@@ -195,6 +196,7 @@ function drawHistogram(i) {
         chart2d.fillRect(x - wide / 2, 0, wide, wide);
         chart2d.fillRect(x - wide / 2, h - wide, wide, wide);
     }
+    below(chart, range[0], range[1], i.kind === "counts" ? "counts" : "−log T");
 }
 // The nearer end of the window follows the pointer.
 let pulled = null;

@@ -1,6 +1,7 @@
 // The Share tab: pictures, files that open anywhere, scenes to save and load.
 import { $input, $select, bytes, chosen, clicks, download, downloadBlob, words, } from "./dom.js";
 import { command, emit } from "./link.js";
+import { captioned } from "./captioned.js";
 import { picture } from "./film.js";
 import { current } from "./views.js";
 export async function offer(method, params, title) {
@@ -18,12 +19,17 @@ function shot() {
     const [width, height] = $select("#shot-size").value.split("x").map(Number);
     void offer("viewer.screenshot", { view: current === "four" ? "iso" : (current ?? "iso"), width, height }, "No picture");
 }
-function film() {
+async function film() {
     const png = picture();
-    if (png)
-        download(png, "flexdt-radiograph.png");
-    else
+    if (!png) {
         emit("note", "error", "No picture", "no radiograph has come yet");
+        return;
+    }
+    const made = await captioned(png).catch((error) => words(error));
+    if (typeof made === "string")
+        emit("note", "error", "No picture", made);
+    else
+        downloadBlob(made, "flexdt-radiograph.png");
 }
 const exported = (format, replay = false) => () => offer("viewer.export", { format, replay }, replay ? "No replay" : "No export");
 async function save() {

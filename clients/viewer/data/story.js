@@ -7,6 +7,8 @@ import { apply } from "./calibrate.js";
 import { folder } from "./data.js";
 import { scanIt } from "./scan_it.js";
 const PHANTOM = "lego";
+// What is estimated: the usual parameters, and how the panel is turned.
+const FREE = ["dO_x", "dO_y", "dO_z", "alpha", "tau_x", "tau_z", "det_roll", "det_pitch"];
 const COMMENT = "misaligned by hand";
 // Offset -> what it is, its unit, the largest and the first value of its slider, what it does to a volume.
 const TRUTH = {
@@ -78,7 +80,7 @@ async function fit() {
         return;
     waiting = true;
     show("Finding beads in all images …");
-    const asked = { datasets: [dataset], phantom: PHANTOM };
+    const asked = { datasets: [dataset], phantom: PHANTOM, free: FREE };
     const report = await call("calibration.fit", asked).catch((error) => words(error));
     if (typeof report === "string") {
         failed(report);
@@ -90,7 +92,12 @@ async function fit() {
         return;
     }
     found = correction;
-    const rows = Object.entries(TRUTH).map(([name, [what, unit]]) => el("div", {}, `${what}: told ${fixed(slider(name).valueAsNumber, 2)}, found ${fixed(correction[name] ?? 0, 3)} ${unit}`));
+    const { parameters } = report;
+    const rows = Object.entries(TRUTH).map(([name, [what, unit]]) => {
+        const one = parameters[name];
+        const seen = one ? `found ${fixed(one.value, 3)} ± ${fixed(one.sigma, 3)} ${unit}` : "not estimated: back to nominal";
+        return el("div", {}, `${what}: told ${fixed(slider(name).valueAsNumber, 2)} ${unit}, ${seen}`);
+    });
     $("#story-found").replaceChildren(...rows);
     next();
 }

@@ -1,5 +1,6 @@
 // A volume: the one that grows while a scan runs, or a past scan's, as flexdt reconstruct makes it. It comes here as a whole, as slices that
 // scroll and in three dimensions, and beside the truth of its sample.
+import { below, beside as valuesBeside } from "./plot_axes.js";
 import { $, $button, $canvas, $input, $select, bars, cleared, clicks, curve, el, fixed, keep, setText, slid, words } from "./dom.js";
 import { call, on, store } from "./link.js";
 import { folder } from "./data.js";
@@ -244,6 +245,7 @@ function drawHistogram() {
     room[0].globalAlpha = 1;
     room[0].fillStyle = style.getPropertyValue("--warn");
     room[0].fillRect((room[1] * level.valueAsNumber) / 1000, 0, 2, room[2]);
+    below(chart, l, h, "per mm");
 }
 function drawProfile() {
     const line = three.profiling ? three.profile() : null;
@@ -254,6 +256,8 @@ function drawProfile() {
         return;
     const known = line.values.filter(Number.isFinite), low = Math.min(...known), high = Math.max(...known);
     curve(plot, line.values, low, high);
+    valuesBeside(plot, low, high, "per mm");
+    below(plot, 0, line.mm, "mm");
     setText($("#volume-at"), known.length ? `${fixed(line.mm, 2)} mm · ${fixed(low, 5)} to ${fixed(high, 5)} per mm` : "no data along this line");
 }
 // The value under the pointer: of the codes at once, and as exact as the volume is when the pointer rests.

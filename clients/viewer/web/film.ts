@@ -1,5 +1,6 @@
 // The radiograph: window and level, zoom, the value under the pointer, beads and flags drawn over it, and its
 // difference from a frame that was kept.
+import { below } from "./plot_axes.js";
 import { $, $button, $canvas, $input, $select, bars, cleared, context2d, fixed, setText, slid } from "./dom.js";
 import type { Four, Kind, Pair, Shown } from "./viewer.js";
 import { call, emit, on, store } from "./link.js";
@@ -161,6 +162,7 @@ function drawHistogram(i: Shown) {
     const x = Math.min(w - 1, Math.max(1, at(v)));
     chart2d.fillRect(x - 1, 0, 2, h); chart2d.fillRect(x - wide / 2, 0, wide, wide); chart2d.fillRect(x - wide / 2, h - wide, wide, wide);
   }
+  below(chart, range[0], range[1], i.kind === "counts" ? "counts" : "−log T");
 }
 // The nearer end of the window follows the pointer.
 let pulled: HTMLInputElement | null = null;

@@ -3,6 +3,7 @@ import { $dialog, $input, el, keep, within } from "./dom.js";
 import { jogStart, jogStop, jogStopAll } from "./axes.js";
 import { command, on, store } from "./link.js";
 import { estop } from "./status.js";
+import { tasks } from "./help_tasks.js";
 import { layout, nearSample } from "./views.js";
 
 // Key -> axis, direction, what it does.
@@ -61,6 +62,7 @@ export function toggleHelp(): void {
     const jogs = Object.entries(JOGS).map(([code, [, , what]]) => [name(code), what]);
     for (const [key, what] of [...jogs, ["Space", "stop all axes"], ["Shift+Space", "emergency stop"], ["Alt+1…5", "views"], ["Alt+0", "the sample, near"], ["F1", "this help"]]) grid.append(el("kbd", {}, key), el("span", {}, what));
     dialog.append(
+      el("h2", {}, "What would you like to do?"), tasks(() => dialog.close()),
       el("h2", {}, "Keys"), grid,
       el("p", { class: "muted" }, HELP),
       el("div", { class: "row between" },

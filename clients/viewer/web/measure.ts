@@ -1,5 +1,6 @@
 // Measuring in the radiograph: a loupe, the profile along a line, the statistics of a region, the ray of a pixel. Places are
 // (column, row) of the full image; what was marked stays and is measured anew in every image.
+import { below, beside } from "./plot_axes.js";
 import { $, $canvas, $select, curve, field, fixed, parsed, setText, words } from "./dom.js";
 import type { Pair, Shown } from "./viewer.js";
 import { call } from "./link.js";
@@ -107,4 +108,6 @@ export function tell(i: Shown | null, value: Value): void {
   if (!values.length) { setText($("#measured"), "outside the image"); return; }
   setText($("#measured"), `${number(low)} to ${number(high)} · ${fixed(Math.hypot(s[2] - s[0], s[3] - s[1]), 1)} px`);
   curve(plot, values, low, high);
+  beside(plot, low, high, i.kind === "counts" ? "counts" : "");
+  below(plot, 0, Math.hypot(s[2] - s[0], s[3] - s[1]), "px");
 }

@@ -10,6 +10,7 @@ import {
   words,
 } from "./dom.js";
 import { command, emit } from "./link.js";
+import { captioned } from "./captioned.js";
 import { picture } from "./film.js";
 import { current } from "./views.js";
 import type { Export, Requests, Scene } from "./viewer.js";
@@ -36,10 +37,15 @@ function shot() {
     "No picture",
   );
 }
-function film() {
+async function film() {
   const png = picture();
-  if (png) download(png, "flexdt-radiograph.png");
-  else emit("note", "error", "No picture", "no radiograph has come yet");
+  if (!png) {
+    emit("note", "error", "No picture", "no radiograph has come yet");
+    return;
+  }
+  const made = await captioned(png).catch((error: unknown) => words(error));
+  if (typeof made === "string") emit("note", "error", "No picture", made);
+  else downloadBlob(made, "flexdt-radiograph.png");
 }
 const exported =
   (format: Export["format"], replay = false) =>

@@ -50,7 +50,7 @@ export type Compose = {
   kV?: number | null; power_W?: number | null; voxel_um?: number | null; keep?: Array<string>
 };
 export type Control = { action: "acquire" | "release" | "force" };
-export type ControlResult = { controller: string | null };
+export type ControlResult = { controller: string | null; yours: boolean };
 export type Correct = {
   parameters: Record<string, number>; name?: string | null; comment?: string; source?: string | null
 };

