@@ -57,6 +57,10 @@ def test_a_half_saved_folder_says_what_it_is(half: Path) -> None:
     with pytest.raises(DatasetError, match=f"{said}, which is another data set than 'bolt'"):
         data_set(seed=2).save(half, resume=True)
     assert len(list(half.glob("scan*"))) == 4
+    (half / "scan settings.txt").write_text("no projection")
+    (half / "unfinished.json").write_text("{broken")
+    with pytest.raises(DatasetError, match=r"half-saved: 4 of \? projections"):
+        fx.open(half)
 
 
 def test_saving_goes_on_where_it_was_interrupted(half: Path, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Collection, Mapping
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -32,6 +33,9 @@ from flexdt.twin.exchange.geometry import ScanGeometry
 from flexdt.twin.exchange.number_tables import geometry_text
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.signatures import File
+
+REFERENCES: Final = ("di", "io")
+"""Beginnings of the names of dark and flat images."""
 
 
 def save_data_set(data: ImageSet, folder: File, resume: bool = False) -> None:
@@ -102,7 +106,8 @@ def unfinished(path: Path) -> str:
         path: of a folder with the file `UNFINISHED`.
     """
     noted = _noted(path)
-    images = sum(1 for entry in path.iterdir() if entry.name.startswith("scan"))
+    tiffs = [entry for entry in path.iterdir() if entry.suffix.lower().startswith(".tif")]
+    images = sum(1 for entry in tiffs if not entry.name.startswith(REFERENCES))
     whole = noted.get("projections", "?")
     return f"{path} is half-saved: {images} of {whole} projections of {noted.get('name', '?')!r}"
 
