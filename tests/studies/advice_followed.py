@@ -37,9 +37,11 @@ ADVISED: Final = (
     "drift_across", "drift_along", "screw", "jump_across", "spot_drift", "runout", "wobble",
     "vibration", "angle_factor", "endpoint", "slip", "sdd_far_off", "panel_far_rolled",
     "axis_far_aslant", "tau_held", "height_held", "across_held", "strain_x", "strain_z", "grows",
-    "source_jumps", "other_pitch", "four_tiles",
+    "source_jumps",
 )  # fmt: skip
-"""Kinds of faults whose findings advise arguments."""
+"""Kinds of faults whose findings advise arguments. Not among them: `other_pitch`, whose sentence
+names the pixels beside dD_z (freed, dD_z is 56 sigma off), and `four_tiles`, whose tiles may have
+no name."""
 
 
 @dataclass(frozen=True)
@@ -76,9 +78,8 @@ def arguments(text: str) -> Iterator[tuple[str, dict[str, object]]]:
     for found in PER_FRAME.finditer(text):
         yield found[0], {"per_frame": tuple(found[1].split(","))}
     for found in FREE.finditer(text):
-        for either in found[1].split(" or "):
-            names = tuple(re.findall(r"\w+", either))
-            yield f"free {','.join(names)}", {"free": names}
+        names = tuple(re.findall(r"\w+", found[1]))
+        yield f"free {','.join(names)}", {"free": names}
     if "--bead-tolerance" in text:
         yield "--bead-tolerance", {"bead_tolerance_mm": BEAD_TOLERANCE_MM}
 

@@ -218,8 +218,8 @@ def judge_priors(loose: FitResult, exact: Container[str] = ()) -> PriorsJudged:
         texts.append(
             _other_pixels(loose, means[names.index("dD_z")] + alone[names.index("dD_z")][0])
         )
-    which = " or ".join(causes)
-    text = f"{'; or '.join(texts)}: free {which} too, or give the prior it has"
+    # One of them alone would take up what is another's.
+    text = f"{'; or '.join(texts)}: free {', '.join(causes)} too, or give the prior it has"
     return PriorsJudged(error("held_parameter", text), 1.0, causes)
 
 
