@@ -7,8 +7,8 @@ import { apply } from "./calibrate.js";
 import { folder } from "./data.js";
 import { scanIt } from "./scan_it.js";
 const PHANTOM = "lego";
-// What is estimated: the usual parameters, and how the panel is turned.
-const FREE = ["dO_x", "dO_y", "dO_z", "alpha", "tau_x", "tau_z", "det_roll", "det_pitch"];
+// What is estimated: the usual parameters, and the panel's roll. Beads hardly tell its tilt from their height.
+const FREE = ["dO_x", "dO_y", "dO_z", "alpha", "tau_x", "tau_z", "det_roll"];
 const COMMENT = "misaligned by hand";
 // Offset -> what it is, its unit, the largest and the first value of its slider, what it does to a volume.
 const TRUTH = {
@@ -87,8 +87,8 @@ async function fit() {
         return;
     }
     const { correction } = report;
-    if (!correction) {
-        failed("The images do not tell the geometry: more views or beads are needed.");
+    if (!correction || !report.identifiable) {
+        failed(`Nothing is applied: ${report.verdict}`);
         return;
     }
     found = correction;

@@ -9,8 +9,8 @@ import { scanIt } from "./scan_it.js";
 import type { JobStatus } from "./viewer.js";
 
 const PHANTOM = "lego";
-// What is estimated: the usual parameters, and how the panel is turned.
-const FREE = ["dO_x", "dO_y", "dO_z", "alpha", "tau_x", "tau_z", "det_roll", "det_pitch"];
+// What is estimated: the usual parameters, and the panel's roll. Beads hardly tell its tilt from their height.
+const FREE = ["dO_x", "dO_y", "dO_z", "alpha", "tau_x", "tau_z", "det_roll"];
 const COMMENT = "misaligned by hand";
 // Offset -> what it is, its unit, the largest and the first value of its slider, what it does to a volume.
 const TRUTH: Record<string, [what: string, unit: string, most: number, first: number, does: string]> = {
@@ -92,7 +92,10 @@ async function fit(): Promise<void> {
   const report = await call("calibration.fit", asked).catch((error: unknown) => words(error));
   if (typeof report === "string") { failed(report); return; }
   const { correction } = report;
-  if (!correction) { failed("The images do not tell the geometry: more views or beads are needed."); return; }
+  if (!correction || !report.identifiable) {
+    failed(`Nothing is applied: ${report.verdict}`);
+    return;
+  }
   found = correction;
   const { parameters } = report;
   const rows = Object.entries(TRUTH).map(([name, [what, unit]]) => {
