@@ -222,19 +222,28 @@ def _lease(client: TwinClient, axis: str, speed: float, seconds: float) -> None:
         for warning in jogged.warnings:  # a contact cuts it short
             if warning != shown:
                 note(shown := warning)
-        if (
-            lease == left
-        ):  # it ends by itself, to the moment: counted from after its start, not from before
-            now = client.state()
-            end = now.time + jogged.duration_s
-            while now.time < end and now.axes[axis].moving:
-                time.sleep(JOG_POLL_S)
-                now = client.state()
-            return
+        if lease == left or pace == math.inf:
+            now = _outwait(client, axis, jogged.duration_s)
+            left -= lease
+            continue
         begun = now.time
         time.sleep(max(JOG_POLL_S, JOG_RENEWED * lease / pace))
         now = client.state()
         left -= min(lease, now.time - begun)
+
+
+def _outwait(client: TwinClient, axis: str, duration_s: float) -> State:
+    """Wait until a lease has ended by itself, and return the state then.
+
+    The last lease ends to the moment. Where time runs as fast as it can, every lease does: a
+    renewal could come before or after its end, and nobody would know for how long the axis moved.
+    """
+    now = client.state()
+    end = now.time + duration_s  # counted from after its start, not from before
+    while now.time < end and now.axes[axis].moving:
+        time.sleep(JOG_POLL_S)
+        now = client.state()
+    return now
 
 
 def stop(twin: Twin) -> Answer:
