@@ -58,15 +58,6 @@ class Views:
         return bool(self.factors.shape[1] > self.images.shape[2])
 
     @property
-    def needed(self) -> Float32Array:
-        """The images' rows that are needed; those off the panel repeat its outermost ones."""
-        count, rows = self.images.shape[1], self.up.shape[1]
-        last = self.top + rows
-        if self.top >= 0 and last <= count:
-            return self.images[:, self.top : last]
-        return self.images[:, np.arange(self.top, last).clip(0, count - 1)]
-
-    @property
     def shown(self) -> slice:
         """The panel's rows that are needed, or that rows off the panel repeat."""
         count = self.images.shape[1]

@@ -119,10 +119,15 @@ class NoiseMeter:
 
     def note(self, views: Views) -> Float32Array:
         """Note what views show and where; returns the sign of each in the alternating sum, (n,)."""
+        from flexdt.twin.reconstruction.kernels import fdk_kernels
+
         n = len(views.images)
         signs = self._signs[self._done : self._done + n]
-        sums = np.tensordot(np.stack([np.ones(n, np.float32), signs]), views.needed, 1)
-        self._means = sums if self._means is None else self._means + sums
+        if self._means is None:
+            shape = (2, views.sizes[3], views.images.shape[2])
+            self._means = np.zeros(shape, np.float32)
+        images = np.ascontiguousarray(views.images)
+        fdk_kernels.add_views(images, views.top, signs, self._means)
         self._hits.append(self._seen_at(views))
         self._response = views.response.astype(np.float64)
         self._done += n

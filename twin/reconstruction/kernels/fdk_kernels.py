@@ -478,6 +478,28 @@ def weigh(images, first, factors, across, up, out):
 
 
 @parallel
+def add_views(images, first, signs, sums):
+    """Add images to their sum, and each with its sign to their alternating sum.
+
+    images: float32 (n, rows of the panel, cols); rows beyond the panel repeat its outermost ones.
+    first: row of the panel that is the first of `sums`.
+    signs: float32 (n,).
+    sums: float32 (2, rows, cols), added to.
+    """
+    _, rows, cols = sums.shape
+    for r in prange(rows):
+        seen = min(max(first + r, 0), images.shape[1] - 1)
+        plain = sums[0, r]
+        alternating = sums[1, r]
+        for view in range(len(images)):
+            line = images[view, seen]
+            sign = signs[view]
+            for c in range(cols):
+                plain[c] += line[c]
+                alternating[c] += sign * line[c]
+
+
+@parallel
 def copy_rows(images, order, first, out):
     """out[n, r, c] = images[order[n], first + r, c], float32, on all cores."""
     n, rows, _ = out.shape
