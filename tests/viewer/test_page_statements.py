@@ -150,20 +150,21 @@ class History:
         self.lab.projector = Process("flexdt.server.projector.main", *words, log=self.lab.log)
         self.projector = True
 
-    def hang_projector(self) -> None:
+    def hang_projector(self, *acts: Callable[[], Any]) -> None:
         process = self.lab.projector.process
         process.send_signal(signal.SIGSTOP)
         self.projector = False
         try:
-            self.without_images()
+            self.without_images(*acts)
         finally:
             process.send_signal(signal.SIGCONT)
         self.projector = True
 
-    def without_images(self) -> None:
-        """What somebody does while no image can be made."""
-        for act in self.rng.sample([self.change_sample, self.move, self.switch], 2):
-            self.told.append(act.__name__)
+    def without_images(self, *acts: Callable[[], Any]) -> None:
+        """What somebody does while no image can be made; drawn where nothing is given."""
+        drawn = self.rng.sample([self.change_sample, self.move, self.switch], 2)
+        for act in acts or drawn:
+            self.told.append(getattr(act, "__name__", "act"))
             act()
             self.agree()
 
@@ -245,5 +246,8 @@ def test_an_abort_of_somebody_else_and_a_hung_projector(
     history.agree()
     assert not page.locator("#job-back").is_visible()
     assert "everything stands where it began" in page.inner_text("#job-what")
-    history.hang_projector()
+    history.call("session.control", action="force")
+    history.call("sample.set", name="lego")
+    history.agree()
+    history.hang_projector(lambda: history.call("sample.set", name="square"), history.move)
     history.agree()
