@@ -132,8 +132,8 @@ def sart(
     """SIRT's step on one subset of views after another: faster at first, noisier in the end.
 
     Args:
-        projections, cone_vec, like, start, nonnegative, variances, hardening, surroundings, watch,
-            progress: as for `sirt`.
+        projections, cone_vec, like, start, nonnegative, variances: as for `sirt`.
+        hardening, surroundings, watch, progress: as for `sirt`.
         iterations: passes through all views.
         subsets: number of subsets; each takes every k-th view, so it sees all directions.
         relaxation: part of each step that is taken.
