@@ -46,6 +46,8 @@ def files_only(path, flags, *mode, dir_fd=None):
     return opened(path, flags, *mode)
 
 os.open = files_only
+# Python asks the disk in Windows' own way there.
+shutil.disk_usage = lambda path: shutil._ntuple_diskusage(2 << 40, 1 << 40, 1 << 40)
 """
 
 TASKS = """
