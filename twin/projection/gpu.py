@@ -32,10 +32,6 @@ DRIVERS = {"win32": "nvcuda.dll"}
 """Name of the CUDA driver's library by platform, where it is not libcuda.so.1."""
 CHUNK_BYTES = 256 * 2**20
 """Images on the device at a time."""
-KEPT_BYTES = 4 * 2**20
-"""Images of a call for which memory is kept, at most."""
-KEPT_VIEWS = 64
-"""Views of such a call; more of them take new memory for what is known of them."""
 SPARE_BYTES = 256 * 2**20
 """What must stay free on a device: for the driver, and for whoever else uses it."""
 VIEWS_A_THREAD = 7 / 16
@@ -156,8 +152,8 @@ def attempt(work: Callable[[], object]) -> bool:
     return True
 
 
-def upload(flat: Float32Array | FloatArray) -> Any:
-    """Copy numbers to the device, where they stay as long as the result is referenced."""
+def upload(flat: Float32Array) -> Any:
+    """Copy voxels to the device, where they stay as long as the result is referenced."""
     from numba import cuda
 
     return cuda.to_device(flat)
@@ -284,72 +280,7 @@ def project(box: Box, voxels: Any, views: FloatArray, out: Float32Array) -> None
         out: C-ordered float32.
     """
     for part in _chunks(out):
-        if out[part].nbytes <= KEPT_BYTES:
-            room = _kept_room()
-            room.project(box, voxels, views[part], out[part])
-            _rooms[:] = [room]
-        else:
-            project_there(box, voxels, views[part], out.shape[1:]).copy_to_host(out[part])
-
-
-@dataclass(frozen=True, eq=False)
-class KeptRoom:
-    """Memory for the images of a small call, kept for the next: new memory costs as much as a view.
-
-    Attributes:
-        there: numbers on the device, (KEPT_BYTES / 4,).
-        here: page-locked ones that images pass on their way to the host, as many.
-        table_there, table: rows of views on the device and page-locked, (KEPT_VIEWS, 13).
-    """
-
-    there: Any
-    here: Float32Array
-    table_there: Any
-    table: FloatArray
-
-    @classmethod
-    def made(cls) -> KeptRoom:
-        """Take new memory."""
-        from numba import cuda
-
-        count, shape = KEPT_BYTES // 4, (KEPT_VIEWS, 13)
-        return cls(
-            cuda.device_array(count, np.float32),
-            cuda.pinned_array(count, np.float32),
-            cuda.device_array(shape, np.float64),
-            cuda.pinned_array(shape, np.float64),
-        )
-
-    def project(self, box: Box, voxels: Any, views: FloatArray, out: Float32Array) -> None:
-        """See the function of this name."""
-        from flexdt.twin.projection.kernels import layout_kernels
-
-        images, passed = self.there[: out.size], self.here[: out.size]
-        shape = out.shape[1:]
-        _launch(box, voxels, views, images, shape, transposed=False, send=self._send)
-        images.copy_to_host(passed)
-        layout_kernels.copy_numbers(passed, out.reshape(-1))
-
-    def _send(self, table: FloatArray) -> Any:
-        """Copy rows of views to the device, which has read the last ones."""
-        if len(table) > len(self.table):
-            return upload(table)
-        part = slice(len(table))
-        self.table[part] = table
-        self.table_there[part].copy_to_device(self.table[part])
-        return self.table_there[part]
-
-
-_rooms: list[KeptRoom] = []
-"""The one that no call uses, if any."""
-
-
-def _kept_room() -> KeptRoom:
-    """The room that no other call uses, or a new one."""
-    try:
-        return _rooms.pop()
-    except IndexError:
-        return KeptRoom.made()
+        project_there(box, voxels, views[part], out.shape[1:]).copy_to_host(out[part])
 
 
 def spread_there(
@@ -481,14 +412,15 @@ def launcher(
     *,
     transposed: bool,
     factor: float = 1.0,
-    send: Callable[[FloatArray], Any] | None = None,
 ) -> Callable[[], None]:
     """What runs the kernels that these views want, each on all of its views at once.
 
     images: flat, on the device. One array goes there: views by kernel, each with the number of its
     image. Views of a detector on its side take its columns for rows, so that lanes are neighbours
-    along z there, too. send: takes that array there; None for memory of its own.
+    along z there, too.
     """
+    from numba import cuda
+
     from flexdt.twin.projection.kernels import gpu_kernels as kernels
 
     rows, cols = shape
@@ -499,7 +431,7 @@ def launcher(
     upright = kernels.LANES_MEET & (rays[:, 9:11] == 0.0).all(axis=1) & (rise <= kernels.RISE)
     kind = KINDS * turned + slabs + (slabs & upright)
     order = np.argsort(kind, kind="stable")
-    table = (send or upload)(np.column_stack([rays, np.arange(len(views))])[order])
+    table = cuda.to_device(np.column_stack([rays, np.arange(len(views))])[order])
     walks = (
         (kernels.spread_rays, kernels.spread_slabs, kernels.spread_columns)
         if transposed

@@ -55,7 +55,7 @@ def occupied(flat, stride_x, stride_y, nz, first, last, first_y, last_y):
 
 
 CHECKED = 1 << 16
-"""Numbers that a thread checks or copies at a time."""
+"""Numbers that a thread checks at a time."""
 SIZE_BITS, INFINITE = np.uint32(0x7FFFFFFF), np.uint32(0x7F800000)
 """Bits of a float32 without its sign, and these of infinity: NaN's are more."""
 
@@ -73,16 +73,6 @@ def unfit_parts(bits):
         if most >= INFINITE:
             unfit += 1
     return unfit
-
-
-@parallel
-def copy_numbers(source, out):
-    """out = source, (n,) float32, on all cores."""
-    runs = (source.size + CHECKED - 1) // CHECKED
-    for run in prange(runs):
-        first = run * CHECKED
-        last = min(source.size, first + CHECKED)
-        out[first:last] = source[first:last]
 
 
 @parallel
