@@ -1,1 +1,1 @@
-"""The library: what a program does with data sets, geometries, scripts and simulated scans."""
+"""Functions of the Python library: data sets, geometries, scripts and simulated scans."""

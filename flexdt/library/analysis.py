@@ -1,7 +1,7 @@
-"""From data sets to geometry and volumes: the public names of what `flexdt.clients` does.
+"""Public functions from data sets to geometry and volumes, as `flexdt.clients` offers them.
 
-Each function is short: it opens what is named as a folder and calls the function that the command
-line calls too.
+Each function is short: it opens data sets named by folders and calls the function that
+the command line calls too.
 """
 
 from __future__ import annotations
@@ -47,11 +47,12 @@ def calibrate(
     Args:
         data: a data set or its folder, or several of the same phantom; None where `markers` and
             `geometry` are all there is.
-        phantom: a phantom, its name, the path of a phantom file, or "unknown": three or more
-            markers of which nobody knows where they are.
+        phantom: a phantom, its name, the path of a phantom file, or "unknown": three or
+            more markers at unknown positions.
         geometry: nominal geometry of all frames, or its file: in place of the data set's, or for a
             folder of anybody's TIFF images (see `read_tiffs`).
-        progress: a bar after two seconds; False for none, or what takes the fraction done.
+        progress: a bar after two seconds; False for no bar, or a function of the fraction
+            done.
         options: OPTIONS
 
     Returns:
@@ -78,7 +79,11 @@ def _calibrated(
     geometry: ConeVec | str | PathLike[str] | None,
     options: CalibrationOptions,
 ) -> Outcome[DataSet]:
-    """Open what is named, and calibrate it; arguments as `calibrate` has them."""
+    """Open the data sets, and calibrate them.
+
+    Args:
+        data, phantom, geometry, options: as for `calibrate`.
+    """
     if isinstance(geometry, str | PathLike):
         geometry = ConeVec.load(geometry)
     markers = options.get("markers")
@@ -128,17 +133,20 @@ def reconstruct(
         iterations: of an iterative algorithm; default: its own.
         weight: of the total variation (tv); default: its own.
         window: of FDK's ramp filter: ram-lak, shepp-logan, cosine, hamming, hann.
-        rings: subtract what pixels add to all views, where that stands out from object and noise;
-            whole columns in full turns alone.
+        rings: subtract the offsets that pixels add to all views, where they exceed object
+            and noise; offsets of entire columns in full turns only.
         material: the object is made of this alone: correct beam hardening. For sirt and sart also
             all the materials it is made of.
         scatter_correction: the material that the object is made of, or all of them: simulate its
             scatter and subtract it (a circular scan).
-        tube: of the scan, for the two corrections; default: what the data set says.
+        tube: of the scan, for the two corrections; default: the tube that the data set
+            states.
         parameters: correction; default: the one in force during the scan, if any.
-        progress: a bar after two seconds; False for none, or what takes the fraction done.
-        errors: of FDK, find what may be off, `volume.bias_bound` and `volume.accuracy`, and warn
-            of it; and find the noise, `volume.sigma` (of a circle, of five rows or more).
+        progress: a bar after two seconds; False for no bar, or a function of the fraction
+            done.
+        errors: of FDK, estimate errors, `volume.bias_bound` and `volume.accuracy`, and
+            warn of them; and find the noise, `volume.sigma` (of a circle, of five rows or
+            more).
 
     Returns:
         Volume of attenuation [1/mm].
@@ -178,13 +186,15 @@ def align(data: Data, *, per_frame: bool = False, progress: Progress = None) -> 
     Args:
         data: a data set or its folder.
         per_frame: look for shifts of single frames (jitter) too; `.dataset` then has them.
-        progress: a bar after two seconds; False for none, or what takes the fraction done.
+        progress: a bar after two seconds; False for no bar, or a function of the fraction
+            done.
 
     Returns:
-        Axis column and, if the object tells them, roll and yaw of the panel and row of the plane in
-        which the source turns, each with its sigma, what is refused and why, and the correction;
-        `document` is the JSON of `flexdt align`. Half a turn and the fan, and single rows, tell the
-        column. Where the scan cannot, `identifiable` is False.
+        Axis column and, if the object determines them, roll and yaw of the panel and row
+        of the plane in which the source turns, each with its sigma, the refused
+        parameters with reasons, and the correction; `document` is the JSON of `flexdt
+        align`. Half a turn and the fan, and single rows, determine the column. Where the
+        scan does not, `identifiable` is False.
 
     Raises:
         TwinError: the folder is no data set, or a frame cannot be read.
@@ -199,7 +209,9 @@ def align(data: Data, *, per_frame: bool = False, progress: Progress = None) -> 
 
 
 def _posed(data: Data, geometry: ConeVec) -> DataSet:
-    """A data set with another nominal geometry, or a folder of anybody's images with theirs."""
+    """Return a data set with another nominal geometry, or read a folder of TIFF images
+    with it.
+    """
     if isinstance(data, DataSet):
         return with_geometry(data, geometry)
     return read_tiffs(data, geometry)

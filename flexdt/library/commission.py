@@ -1,9 +1,9 @@
-"""`flexdt commission` without its command line: folders of past scans in; a machine, a profile and
-what contradicts what out.
+"""`flexdt commission` without its command line: a machine and a profile from folders of
+past scans, with their contradictions.
 
-The machine is the one that ships and that the texts name, with the signs and rates of the texts,
-fitted to the executed scripts; `flexdt.twin.commissioning` says the rest. A scan that cannot be
-read is no error: it is named among what could not be judged.
+The machine is the shipped one that the texts name, with the signs and rates of the texts,
+fitted to the executed scripts; see `flexdt.twin.commissioning`. A scan that cannot be
+read is no error: it is listed as a question.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ from flexdt.twin.script.log_fit import Fit, fit_machine
 from flexdt.twin.script.parse import read_script
 
 MOST_NEXT: Final = 3
-"""Scans that are proposed; a list of all nobody follows."""
+"""Largest number of proposed scans."""
 ENOUGH: Final = 3
-"""Times of a kind of command from which on its range is its own (`docs/machine-fit.md`)."""
+"""Durations of a kind of command from which its range is estimated (`docs/machine-fit.md`)."""
 NEXT: Final = {
     "ordinary": ("a full turn of any object with structure", "fly --frames 721"),
     "magnified": ("the same at another magnification", "fly --frames 721 --sod {sod:.0f}"),
@@ -48,10 +48,10 @@ NEXT: Final = {
     "beads": ("a bead phantom at two distances, then `flexdt calibrate`", "calibration"),
     "recorded": ("a scan with `flexdt follow ADDRESS --record FILE` beside it", "calibration"),
 }
-"""Kind of scan -> what it is, and the words that `flexdt script new --kind` needs."""
+"""Kind of scan -> its description, and the options of `flexdt script new --kind`."""
 NEARER: Final = 0.6
-"""Of its source-object distance, the scan at another magnification: clearly other, and the sample
-still clears the source in most scanners."""
+"""Source-object distance of the scan at another magnification over its own: clearly
+different, and the sample still clears the source in most scanners."""
 MACHINE_FILE: Final = "machine.toml"
 PROFILE_FILE: Final = "profile.toml"
 ReadLog = Callable[[Path, d.Machine], tuple[Executed, ...]]
@@ -59,8 +59,10 @@ Table = tuple[Sequence[str], list[Sequence[Any]]]
 
 
 class Commissioned(NamedTuple):
-    """What past scans tell: the fitted machine and its file, `fit` of the executed scripts (None
-    without any), the scans with the oldest first, zero offsets, contradictions and questions."""
+    """The result of commissioning: the fitted machine and its file, `fit` of the executed
+    scripts (None without any), the scans with the oldest first, zero offsets,
+    contradictions and questions.
+    """
 
     machine: d.Machine
     text: str
@@ -71,7 +73,14 @@ class Commissioned(NamedTuple):
     questions: Sequence[Question]
 
     def tables(self, out: Path) -> dict[str, Table]:
-        """The report: title -> head and rows; `out` is the folder that its commands name."""
+        """Make the report's tables.
+
+        Args:
+            out: the folder that the commands in them name.
+
+        Returns:
+            Title -> head and rows.
+        """
         votes = Counter(q.settled_by for q in self.questions if q.settled_by)
         sod = next((s.settings.sod_mm for s in self.scans[::-1] if s.settings), None) or 1000.0
         files = f"--machine {out / 'machine.toml'} --profile {out / 'profile.toml'}"
@@ -102,7 +111,14 @@ class Commissioned(NamedTuple):
         }  # fmt: skip
 
     def document(self, out: Path) -> dict[str, object]:
-        """`commission.json`: the tables, each row an object, and the fit."""
+        """Make `commission.json`: the tables, each row an object, and the fit.
+
+        Args:
+            out: the folder that its commands name.
+
+        Returns:
+            machine, profile, fit, and a list of rows for each title of `tables`.
+        """
         rows = {
             title: [dict(zip(head, row, strict=True)) for row in rows]
             for title, (head, rows) in self.tables(out).items()
@@ -116,11 +132,12 @@ class Commissioned(NamedTuple):
 
 
 def commission(folders: Sequence[Path], traffic: Path | None, read_log: ReadLog) -> Commissioned:
-    """What past scans tell of a machine.
+    """Estimate a machine and its profile from past scans.
 
     Args:
         folders: of scans, as the scanner or a twin writes them.
-        traffic: a recording of `flexdt follow`, or a log; what is in a folder too counts once.
+        traffic: a recording of `flexdt follow`, or a log; lines that a folder has too
+            count once.
         read_log: reads an executed script or a recording.
 
     Raises:
@@ -172,7 +189,7 @@ def commission(folders: Sequence[Path], traffic: Path | None, read_log: ReadLog)
 
 
 def _refused(machine: d.Machine, profile: d.Profile) -> Iterator[tells.Finding]:
-    """Why `flexdt machine check` would refuse the machine's file, if it would."""
+    """Yield the error of `flexdt machine check` for the machine's file, if there is one."""
     try:
         check_home(machine, profile, MACHINE_FILE)
     except TwinError as error:
@@ -184,7 +201,12 @@ def _nothing(question: Question) -> None:
 
 
 def _texts(folder: Path, ask: Callable[[Question], None]) -> PastScan:
-    """The scan as its settings texts and the names of its images tell it."""
+    """Read a scan's settings texts and the names of its images.
+
+    Args:
+        folder: of the scan.
+        ask: takes each warning as a question.
+    """
     content, warnings = list_folder(folder), list[str]()
     scan = PastScan(str(folder), images=len(content.projections))
     try:
@@ -209,7 +231,14 @@ def _texts(folder: Path, ask: Callable[[Question], None]) -> PastScan:
 def _script(
     scan: PastScan, machine: d.Machine, read_log: ReadLog, ask: Callable[[Question], None]
 ) -> PastScan:
-    """The scan with its executed script, or else with the script that was submitted."""
+    """Add the executed script to a scan, or else the script that was submitted.
+
+    Args:
+        scan: whose folder is searched.
+        machine: for the names of motors.
+        read_log: reads an executed script.
+        ask: takes the errors of files that are neither.
+    """
     content = list_folder(Path(scan.name))
     for name in sorted(content.names - {content.scan_settings, content.xre_settings}):
         path = content.path / name
@@ -227,7 +256,15 @@ def _script(
 
 
 def _fitted(scans: Sequence[PastScan], shipped: d.Machine) -> tuple[d.Machine, str, Fit | None]:
-    """The machine of the texts' signs and rates and of the executed scripts, and its file."""
+    """Fit a machine to the texts' signs and rates and to the executed scripts.
+
+    Args:
+        scans: past scans.
+        shipped: the machine to begin with.
+
+    Returns:
+        The machine, the text of its file, and the fit; None without executed scripts.
+    """
     turning = shipped.geometry.get("angle", {})
     axes = {n: a if n in turning else _stated(a, n, scans, shipped)
             for n, a in shipped.axes.items()}  # fmt: skip
@@ -247,7 +284,14 @@ def _fitted(scans: Sequence[PastScan], shipped: d.Machine) -> tuple[d.Machine, s
 
 
 def _stated(axis: d.Axis, name: str, scans: Sequence[PastScan], machine: d.Machine) -> d.Axis:
-    """An axis with the rates of the last settings text, and the sign of most of them."""
+    """Return an axis with the rates of the last settings text, and the sign of most of them.
+
+    Args:
+        axis: of the shipped machine.
+        name: its motor.
+        scans: past scans.
+        machine: of the axis.
+    """
     told = [(s, m) for s in scans if s.settings and (m := s.settings.motors.get(name))]
     signs = Counter[int]()
     for scan, motor in told:
@@ -266,7 +310,7 @@ def _stated(axis: d.Axis, name: str, scans: Sequence[PastScan], machine: d.Machi
 
 
 def _measured(scan: PastScan, machine: d.Machine, ask: Callable[[Question], None]) -> PastScan:
-    """The scan with how the machine stood, and with what its images tell of the axis."""
+    """Add the poses of a scan, and its alignment; a failure becomes a question."""
     try:
         scan = tells.standing(scan, machine)
         if not scan.images:
@@ -282,11 +326,16 @@ def _measured(scan: PastScan, machine: d.Machine, ask: Callable[[Question], None
 
 
 def write_commission(found: Commissioned, out: Path) -> None:
-    """Write `machine.toml`, `profile.toml`, `commission.json` and `report.html` into a new folder,
-    which appears when all of it is there and both files are read back.
+    """Write `machine.toml`, `profile.toml`, `commission.json` and `report.html` into a
+    new folder, which appears when all files are complete and both TOML files are read
+    back.
+
+    Args:
+        found: the result of `commission`.
+        out: the folder.
 
     Raises:
-        MachineFileError: what was written does not hold.
+        MachineFileError: a written file is invalid.
         OSError: it cannot be written.
     """
     part = out.absolute().with_name(f".{out.absolute().name}.part.{os.getpid()}")

@@ -36,14 +36,15 @@ TOLERANCE_PX: Final = 0.5
 
 
 FIGURES: Final = ("rms_px", "max_px", "image_rms")
-"""Of one correction: rms and largest residual of the beads [px], rms of the difference images."""
+"""Figures of one correction: rms and largest residual of the beads [px], rms of the
+difference images."""
 SHOWN: Final = 4
-"""Frames of which difference images are made."""
+"""Number of frames with difference images."""
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """A data set beside the twin.
+    """A data set compared with the twin.
 
     Attributes:
         document: the JSON of `flexdt compare`.
@@ -79,14 +80,15 @@ def compare_folder(
 
     Args:
         folder: the data set; TIFFs and the two settings texts are enough.
-        phantom: what was scanned, by value, name or file.
+        phantom: that was scanned, by value, name or file.
         tolerance_px: largest allowed rms residual of the beads after correction, per coordinate.
         shown: frames of which difference images are made.
 
     Raises:
         DatasetError: no data set.
         NotIdentifiableError: the data do not determine a correction.
-        TwinError: they contradict the phantom or the angles; says what was found.
+        TwinError: they contradict the phantom or the angles; the message has the
+            findings.
     """
     begun = time.perf_counter()
     dataset = load_dataset(folder)
@@ -132,7 +134,7 @@ def bead_residuals(outcome: Outcome[ImageSet], parameters: Offsets) -> FloatArra
 def virtual(
     phantom: Phantom, dataset: ImageSet, frames: tuple[int, ...], parameters: Offsets
 ) -> Float32Array:
-    """The twin's line integrals of some frames, (m, rows, cols)."""
+    """Simulate line integrals of some frames by the twin, (m, rows, cols)."""
     cone = dataset.poses[np.array(frames)].cone_vec(parameters)
     return line_integrals(phantom, cone, dataset.shape)
 
@@ -146,7 +148,9 @@ def _figures(residual: FloatArray, images: Float32Array | None) -> dict[str, flo
 
 
 def rows_of(document: Mapping[str, Any]) -> list[tuple[Any, ...]]:
-    """The rows of a comparison's table: correction, rms and largest [px], rms of the images."""
+    """List the rows of a comparison's table: correction, rms and largest [px], rms of the
+    images.
+    """
     return [
         (name, *(document[name][figure] for figure in FIGURES))
         for name in ("before", "after", "in_force")
@@ -155,7 +159,12 @@ def rows_of(document: Mapping[str, Any]) -> list[tuple[Any, ...]]:
 
 
 def write_comparison(comparison: Comparison, out: Path) -> None:
-    """Write report.html, compare.json and the difference images (float32 TIFF) into a folder."""
+    """Write report.html, compare.json and the difference images into a folder.
+
+    Args:
+        comparison: of a data set with the twin.
+        out: the folder, made if needed; images are float32 TIFF.
+    """
     import tifffile
 
     out.mkdir(parents=True, exist_ok=True)

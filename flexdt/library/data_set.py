@@ -39,21 +39,21 @@ class DataSet(ImageSet):
         name: the scan's.
         frames: all projections the scan should have, in order; `present` says which are there.
         shape: image (rows, cols) of the first projection.
-        cone_vec: nominal, uncorrected geometry of `frames`: what the file says, or the texts give.
+        cone_vec: nominal, uncorrected geometry of `frames`, from the file or the texts.
         correction: in force during the scan, or given since: in `geometry`, not in `cone_vec`.
-        folder: where it lies, None in memory.
+        folder: its folder, None in memory.
         darks, flats: paths of the dark and flat images that are there.
         arrays: the images, where they are in memory.
         nominal: nominal poses of `frames`; None where `cone_vec` is all that is known.
         positions: motor -> (n,) positions of `frames` [mm, deg], script's sign.
-        machine, profile: what the poses come from; None for an unknown scanner.
+        machine, profile: from which the poses follow; None for an unknown scanner.
         settings: the scanner's text, None if there is none.
         document: flexdt.json, None if there is none.
-        complete: whether the scan says it finished and no file is missing.
+        complete: whether the scan reports its end and no file is missing.
         reason: why it is not complete.
-        warnings: what is doubtful.
+        warnings: doubts about the data set.
         full_scale: largest count of the panel; None where it is not known.
-        truth: of a simulated data set, what lies behind it.
+        truth: of a simulated data set, its sample and settings.
 
     Example:
         >>> import numpy as np
@@ -81,7 +81,8 @@ class DataSet(ImageSet):
         Args:
             phantom: a phantom, its name, the path of a phantom file, or "unknown".
             geometry: nominal geometry of all frames, or its file, in place of the data set's.
-            progress: a bar after two seconds; False for none, or what takes the fraction done.
+            progress: a bar after two seconds; False for no bar, or a function of the
+                fraction done.
             options: OPTIONS
         """
         from flexdt.library.calibration.calibrate import calibrate_with
@@ -161,20 +162,21 @@ class DataSet(ImageSet):
         """Write a folder that `flexdt.open` reads: di000000.tif, io000000.tif, scan_000000.tif ...
         (uint16) and the geometry.
 
-        geometry.json holds the geometry with the correction in force, warnings and the largest
-        count of the panel. A data set with flexdt.json
-        keeps that instead, as long as it has all of its projections; texts are copied. A data set
-        in memory gets the scanner's two texts, `scan settings.txt` and `data settings XRE.txt`,
-        where they can say its geometry: a circle in the plane z = 0 with equal steps and an upright
-        panel of square pixels. Dark and flat images in memory that are no whole numbers are
-        rounded.
+        geometry.json holds the geometry with the correction in force, warnings and the
+        largest count of the panel. A data set with flexdt.json keeps that instead, as
+        long as it has all of its projections; texts are copied. A data set in memory gets
+        the scanner's two texts, `scan settings.txt` and `data settings XRE.txt`, where
+        they can express its geometry: a circle in the plane z = 0 with equal steps and an
+        upright panel of square pixels. Dark and flat images in memory that are no
+        integers are rounded.
 
         Args:
             folder: made if it is not there; it must be empty.
             resume: go on in a folder in which saving this data set was interrupted.
 
         Raises:
-            DatasetExistsError: something is there; says whether it is half-saved.
+            DatasetExistsError: the folder is not empty; the message tells whether it is
+                half-saved.
             OSError: it cannot be written.
 
         Example:
@@ -215,7 +217,7 @@ class DataSet(ImageSet):
         save_nxtomo(self, file)
 
     def to_xarray(self) -> Any:
-        """Line integrals as an xarray DataArray (view, row, column), which needs xarray.
+        """Return line integrals as an xarray DataArray (view, row, column), which needs xarray.
 
         Raises:
             TwinError: xarray is not installed.
@@ -277,7 +279,7 @@ class DataSet(ImageSet):
 
 
 def _names(materials: str | Sequence[str] | None) -> tuple[str, ...] | None:
-    """The names of several materials, or of one."""
+    """Return the names of several materials, or of one."""
     if materials is None:
         return None
     return (materials,) if isinstance(materials, str) else tuple(materials)

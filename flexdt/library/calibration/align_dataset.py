@@ -25,17 +25,17 @@ from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.scanner.state import NamedCorrection
 
 MOST: Final = 0.1
-"""Of the panel's shorter side: larger steps of a panel are those of a tiled scan."""
+"""Largest step of a panel that is no tiling, as a share of the panel's shorter side."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Aligned(Generic[Images_co]):
-    """What a scan without a phantom tells of its geometry.
+    """Geometry estimated from a scan without a phantom.
 
     Attributes:
-        alignment: everything about it.
+        alignment: the estimate with all its details.
         document: the JSON of `flexdt align`.
-        dataset: of what, with the motion that was found.
+        dataset: the aligned data set, with the estimated motion.
     """
 
     alignment: Alignment
@@ -56,13 +56,14 @@ class Aligned(Generic[Images_co]):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What is doubtful about the scan."""
+        """Doubts about the scan and its alignment."""
         return (*self.dataset.warnings, *self.alignment.warnings)
 
     @property
     def parameters(self) -> Mapping[str, Mapping[str, object]]:
-        """Name -> {value, sigma, unit}: axis_column_px [px] and, if the images tell them, det_roll
-        and det_yaw [deg] and source_row_px [px]."""
+        """Name -> {value, sigma, unit}: axis_column_px [px] and, if the images determine
+        them, det_roll and det_yaw [deg] and source_row_px [px].
+        """
         found: Mapping[str, Mapping[str, object]] = self.document["parameters"]  # type: ignore[assignment]
         return found
 
@@ -72,7 +73,7 @@ class Aligned(Generic[Images_co]):
         in force, with dO_x, det_roll, det_yaw and dD_y replaced.
 
         Raises:
-            NotIdentifiableError: there is none; says why.
+            NotIdentifiableError: there is no correction; the message gives the reason.
         """
         offsets = self.alignment.offsets
         if offsets is None:
@@ -129,7 +130,16 @@ def align_dataset(data: Images, per_frame: bool = False) -> Aligned[Images]:
 
 
 def _at_rest(data: ImageSet) -> tuple[Callable[[int], Float32Array], Poses]:
-    """Line integrals and poses, the images moved instead of a panel that steps about a little."""
+    """Return line integrals and poses, with small steps of the panel undone.
+
+    Args:
+        data: the scan.
+
+    Returns:
+        Line integrals (rows, cols) of a frame by its index, and the poses. Where the
+        panel steps by a few pixels, images are shifted and the panel of the poses is at
+        rest.
+    """
     poses = data.poses
     aside = poses.detector - poses.detector.mean(axis=0)
     steps = np.stack([(aside * side).sum(1) / (side**2).sum(1) for side in (poses.v, poses.u)], 1)

@@ -20,11 +20,11 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 
 DIGITS: Final = 3
-"""Decimals of a pixel in a file of tracks."""
+"""Decimals of pixel positions in a file of tracks."""
 
 
 def predictions(fit: FitResult, geometry: Sequence[Offsets]) -> FloatArray:
-    """Predicted bead positions (n, k, 2) [px] in every frame, also of beads that were not seen.
+    """Predict bead positions (n, k, 2) [px] in every frame, also of beads that were not seen.
 
     Args:
         fit: gives the frames and the beads.
@@ -40,10 +40,10 @@ def predictions(fit: FitResult, geometry: Sequence[Offsets]) -> FloatArray:
 
 
 def tracks_document(outcome: Outcome[ImageSet]) -> dict[str, object]:
-    """Measured and predicted bead positions of every frame, (column, row) in pixels.
+    """Return measured and predicted bead positions of every frame, (column, row) in pixels.
 
-    `before` is the correction in force during the scan, or the nominal geometry; `after` the
-    fitted one, null where there is none to be used. Unseen beads are null.
+    `before` is the correction in force during the scan, or the nominal geometry; `after`
+    the fitted one, null where it must not be used. Unseen beads are null.
     """
     result = outcome.calibration
     fit = result.fit
@@ -79,7 +79,7 @@ def tracks_document(outcome: Outcome[ImageSet]) -> dict[str, object]:
 
 
 def write_tracks(outcome: Outcome[ImageSet], path: Path) -> None:
-    """Write `tracks_document` as JSON, under its final name only when it is whole."""
+    """Write `tracks_document` as JSON; the file appears under its name only when complete."""
     write_whole(path, json.dumps(tracks_document(outcome)) + "\n")
 
 
@@ -91,10 +91,10 @@ def _pixels(points: npt.NDArray[np.float64]) -> list[list[float] | None]:
 
 
 def _seen_rms(residual: FloatArray) -> float | None:
-    """`coordinate_rms` of the beads that were seen; None where none was."""
+    """Return `coordinate_rms`, or None if no bead was seen."""
     return coordinate_rms(residual) if np.isfinite(residual).any() else None
 
 
 def coordinate_rms(residual: FloatArray) -> float:
-    """Root mean square per coordinate [px], of the beads that were seen."""
+    """Return the root mean square per coordinate [px] over the beads that were seen."""
     return float(np.sqrt(np.nanmean(residual**2)))

@@ -2,8 +2,8 @@
 
 The functions return plain values in the JSON shapes of docs/calibration.md, and the full outcome.
 
-A verdict says what a calibration may be used for, in a sentence; next come the commands that would
-tell more.
+A verdict states in a sentence how a calibration may be used; the commands after it would
+determine more.
 """
 
 from __future__ import annotations
@@ -59,10 +59,10 @@ class Outcome(Generic[Images_co]):
     """A calibration of data sets.
 
     Attributes:
-        calibration: everything about it.
+        calibration: the calibration with all its details.
         document: the JSON of `flexdt calibrate`.
-        datasets: what was calibrated, with the motion that was found.
-        phantom: with what.
+        datasets: the calibrated data sets, with the estimated motion.
+        phantom: the phantom that was scanned.
     """
 
     calibration: Calibration
@@ -92,19 +92,21 @@ class Outcome(Generic[Images_co]):
 
     @property
     def verdict(self) -> str:
-        """What the calibration may be used for, in a sentence or two."""
+        """How the calibration may be used, in a sentence or two."""
         return str(self.document["verdict"])
 
     @property
     def parameters(self) -> Mapping[str, Mapping[str, object]]:
-        """Name -> {value, sigma, low, high, unit, images, priors, prior, asked} [mm, deg], as
-        `Estimate` describes them; what was not asked for and has a prior comes last."""
+        """Name -> {value, sigma, low, high, unit, images, priors, prior, asked} [mm,
+        deg], as `Estimate` describes them; parameters with a prior that were not
+        requested come last.
+        """
         found: Mapping[str, Mapping[str, object]] = self.document["parameters"]  # type: ignore[assignment]
         return found
 
     @property
     def parts(self) -> Iterator[tuple[Images_co, slice]]:
-        """Each data set, with where its frames stand among those of all."""
+        """Each data set, with the slice of its frames among those of all."""
         first = 0
         for dataset in self.datasets:
             yield dataset, slice(first, first + len(dataset))
@@ -164,15 +166,16 @@ def calibrate_datasets(
         datasets: of the same phantom.
         phantom: a phantom, its name, the path of a phantom file, or UNKNOWN: markers of unknown
             positions, in one data set.
-        request: what to estimate; None is the thesis's six parameters, or dO_x for unknown markers.
-        markers: where they are seen in one data set, or the file that says it (see
-            `read_markers`); None: they are detected in the images.
+        request: the parameters to estimate; None is the thesis's six parameters, or dO_x
+            for unknown markers.
+        markers: their pixels in one data set, or a file of them (see `read_markers`);
+            None: they are detected in the images.
         scale: a known distance of two unknown markers, or its text (see `Scale.of`).
         radius_px: of their spots; None: any from 1.5 px up.
 
     Raises:
-        TwinError: the phantom has no beads, the request names what does not exist, or the file of
-            markers does not hold.
+        TwinError: the phantom has no beads, the request names what does not exist, or the
+            file of markers is invalid.
     """
     start = time.perf_counter()
     if isinstance(scale, str):
@@ -240,10 +243,10 @@ def calibrate_datasets(
 
 @contextmanager
 def saturation_named(saturated: Sequence[Finding]) -> Iterator[None]:
-    """Put saturated images before the message of an error that they explain.
+    """Prefix an error with the saturated images that explain it.
 
     Raises:
-        TwinError: the error that was raised, after what is saturated.
+        TwinError: the error that was raised, preceded by the saturated images.
     """
     try:
         yield
@@ -271,9 +274,10 @@ def with_undetermined(result: Calibration) -> Calibration:
 
 
 def saturation(dataset: ImageSet) -> Finding | None:
-    """A finding if the open beam fills the detector: what is thin then looks like nothing.
+    """Return a finding if the open beam saturates the detector, else None.
 
-    Calibration survives it (beads are dark), but the body that is subtracted is not what was seen.
+    Thin objects are invisible then. Calibration survives it (beads are dark), but the
+    body that is subtracted differs from the one in the images.
     """
     if dataset.machine is None or not dataset.flats:
         return None
@@ -290,7 +294,7 @@ def saturation(dataset: ImageSet) -> Finding | None:
 
 
 def find_phantom(phantom: str | Phantom) -> Phantom:
-    """A phantom that has beads, by value, name or file.
+    """Return a phantom that has beads, by value, name or file.
 
     Raises:
         TwinError: there is no such phantom, or it has no beads.
@@ -312,15 +316,24 @@ def find_phantom(phantom: str | Phantom) -> Phantom:
 
 
 UNDETERMINED: Final = "undetermined"
-"""Code of the finding that the images do not determine what was asked for."""
+"""Code of the finding that the images do not determine the requested parameters."""
 OF_SATURATION: Final = ("bead_size",)
 """Codes of findings that saturated images cause."""
 NUMBERS: Final = ("value", "sigma", "low", "high", "images")
-"""Of an estimate: null where they must not be used."""
+"""Members of an estimate that are null where they must not be used."""
 
 
 def calibration_document(result: Calibration, seconds: float) -> dict[str, object]:
-    """The JSON of `flexdt calibrate`; numbers are null where they must not be used."""
+    """Make the JSON of `flexdt calibrate`.
+
+    Args:
+        result: of the calibration.
+        seconds: the calibration took [s].
+
+    Returns:
+        verdict, identifiable, parameters, weak directions, findings and the rest of
+        docs/calibration.md; numbers are null where they must not be used.
+    """
     fit = result.fit
     frames = sum(len(s.frames) for s in result.scans)
     seen = image_quantities(fit) if fit is not None and result.identifiable else ()
@@ -389,10 +402,16 @@ def calibration_document(result: Calibration, seconds: float) -> dict[str, objec
 
 
 def inside_95(outcome: Outcome[ImageSet], truth: Mapping[str, float]) -> bool:
-    """Whether a truth (edge units) lies in the joint 95 % ellipsoid of the estimated parameters.
+    """Return whether a truth is in the joint 95 % ellipsoid of the estimated parameters.
 
-    Offsets the truth does not mention are at their nominal value; alpha is compared modulo a
-    turn. What has no prior either must be as it was assumed, or the answer is no.
+    Args:
+        outcome: of a calibration.
+        truth: offset -> value in edge units [mm, deg]; offsets that it leaves out are
+            nominal. alpha is compared modulo a turn.
+
+    Returns:
+        False also where nothing is identifiable, or where a parameter that was neither
+        estimated nor had a prior differs from the value that was assumed.
     """
     fit = outcome.calibration.fit
     if fit is None or not outcome.calibration.identifiable:
@@ -421,7 +440,8 @@ SHARP_PX: Final = 0.25
 """Largest sigma of the axis column with which a volume is as sharp as its voxels [px]; assumed: a
 column that is off by d makes an edge d pixels wider."""
 ELSEWHERE: Final = 0.7
-"""SOD of a second placement as part of the first's: nearer, where offsets act differently."""
+"""Source-object distance of a second placement over the first's: nearer, where offsets
+act differently."""
 
 _COMPARE: Final = "flexdt compare {data} --phantom {phantom} --out DIR"
 NEXT: Final[Mapping[str, Sequence[str]]] = {
@@ -431,11 +451,12 @@ NEXT: Final[Mapping[str, Sequence[str]]] = {
     "angle_scale": ("flexdt calibrate {data} --phantom {phantom} --free {free},angle_scale",),
     "held_parameter": (),  # its own sentence names the parameter to free
 }
-"""Code of what forbids a result -> what would settle it; else images beside the twin's."""
+"""Code of a finding that forbids a result -> commands that would settle it; other codes
+compare the images with the twin's."""
 
 
 def verdict_of(result: Calibration, seen: Sequence[Mapping[str, Estimate]]) -> str:
-    """One sentence on use, and one on what limits it.
+    """Return one sentence on use, and one on the limit of the calibration.
 
     Args:
         result: of a calibration.
@@ -465,17 +486,23 @@ def verdict_of(result: Calibration, seen: Sequence[Mapping[str, Estimate]]) -> s
 
 
 def _column(seen: Sequence[Mapping[str, Estimate]]) -> Estimate:
-    """Give the axis's column of the group of frames that tells it least."""
+    """Return the axis column of the group of frames that determines it least."""
     return max((q["axis_column"] for q in seen), key=lambda e: e.sigma)
 
 
 def _is_sharp(fit: FitResult) -> bool:
-    """Whether the axis's column is known well enough for a sharp volume."""
+    """Return whether the axis column is known well enough for a sharp volume."""
     return _column(image_quantities(fit)).sigma <= SHARP_PX
 
 
 def next_commands(result: Calibration, data: Sequence[str], phantom: str) -> list[str]:
-    """Commands that would tell more, or settle what forbids the result; most useful first."""
+    """List commands that would determine more, or settle an error; most useful first.
+
+    Args:
+        result: of the calibration.
+        data: folders of its data sets.
+        phantom: its name or file.
+    """
     names = " ".join(shlex.quote(one) for one in data)
     estimates = {} if result.fit is None else result.fit.certificate.estimates
     asked = [e for e in estimates.values() if e.asked]
@@ -511,14 +538,14 @@ def _by_priors(estimate: Estimate) -> bool:
 
 
 def digits(value: float | None, sigma: float | None) -> str:
-    """A value to the digits that its sigma leaves."""
+    """Format a value to the digits that its sigma leaves."""
     if value is None or sigma is None or not sigma > 0:
         return "-"
     return f"{value:.{min(max(1 - math.floor(math.log10(sigma)), 0), 9)}f}"
 
 
 def rounded_up(sigma: float) -> str:
-    """A sigma to one digit, never a smaller one: 0.012 is 0.02."""
+    """Format a sigma rounded up to one digit: 0.012 is 0.02."""
     if not sigma > 0:
         return "0"
     place = math.floor(math.log10(sigma))
@@ -526,7 +553,7 @@ def rounded_up(sigma: float) -> str:
 
 
 def ranges(numbers: Iterable[int]) -> str:
-    """Growing numbers in words: 2, 5-9, 12."""
+    """Format growing numbers as ranges: 2, 5-9, 12."""
     runs = [
         [n for _, n in run]
         for _, run in groupby(enumerate(sorted(numbers)), lambda pair: pair[1] - pair[0])

@@ -1,4 +1,4 @@
-"""What may be said to a calibration: one declaration, which `flexdt.calibrate`,
+"""The options of a calibration: one declaration, which `flexdt.calibrate`,
 `DataSet.calibrate` and `flexdt calibrate` have in common.
 """
 

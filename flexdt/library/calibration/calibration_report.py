@@ -22,7 +22,7 @@ from flexdt.twin.calibration.fit.fit import FitResult
 
 HEAD = ("parameter", "value", "sigma", "of it from the images", "prior", "95 % from", "to", "unit")
 ELLIPSES = 6
-"""Pairs of parameters drawn, most correlated first."""
+"""Number of parameter pairs drawn, most correlated first."""
 MAP_FRAMES = 180
 """Largest number of frames whose residuals are drawn over the detector; of more frames, every
 second, third... is drawn."""
@@ -38,7 +38,14 @@ def write_report(outcome: Outcome[ImageSet], path: Path) -> None:
 
 
 def report(outcome: Outcome[ImageSet]) -> str:
-    """The whole page."""
+    """Make the HTML report of a calibration.
+
+    Args:
+        outcome: of the calibration.
+
+    Returns:
+        A page with verdict, findings, parameters, residuals, trajectories and ellipses.
+    """
     document: Any = outcome.document
     result, names = outcome.calibration, ", ".join(d.name for d in outcome.datasets)
     body: list[str] = [
@@ -63,6 +70,7 @@ def report(outcome: Outcome[ImageSet]) -> str:
 
 
 def _fit_parts(fit: FitResult, document: Mapping[str, Any]) -> list[str]:
+    """Make the tables of parameters, spectrum and correlations of a fit, as HTML parts."""
     c = fit.certificate
     rows = [
         [
@@ -126,6 +134,7 @@ def _ellipses(c: Certificate) -> list[str]:
 
 
 def _pictures(outcome: Outcome[ImageSet], fit: FitResult) -> list[str]:
+    """Draw trajectories, residuals by frame and detector maps, and tabulate beads, as HTML."""
     c = fit.certificate
     beads = range(c.used.shape[1])
     frames = np.arange(len(c.used))
@@ -184,7 +193,13 @@ def _pictures(outcome: Outcome[ImageSet], fit: FitResult) -> list[str]:
 def _maps(
     outcome: Outcome[ImageSet], fit: FitResult, residuals: npt.NDArray[np.float64]
 ) -> list[str]:
-    """Residuals over the detector, one map a scan, enlarged so that a typical one can be seen."""
+    """Draw residuals over the detector, one map a scan, enlarged to be visible.
+
+    Args:
+        outcome: gives the data sets.
+        fit: gives the measured positions [px].
+        residuals: (n, k, 2) [px].
+    """
     places = fit.problem.pixels
     rms = fit.certificate.rms_px
     factor = 10.0 ** math.floor(math.log10(30.0 / rms)) if rms > 0 else 1.0

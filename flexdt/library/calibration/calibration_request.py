@@ -30,11 +30,11 @@ OF_DETECTION: Final[Mapping[str, str]] = {
     "scale": "scale",
     "radius": "radius_px",
 }
-"""Option -> argument of `calibrate_datasets`: what says where the beads are."""
+"""Option -> argument of `calibrate_datasets`, for the options of bead detection."""
 
 
 def request_of(phantom: object, options: CalibrationOptions) -> CalibrationRequest:
-    """Give what a calibration is to estimate, the defaults filled in.
+    """Make the request of a calibration, the defaults filled in.
 
     Args:
         phantom: as of `flexdt.calibrate`.
@@ -57,5 +57,5 @@ def request_of(phantom: object, options: CalibrationOptions) -> CalibrationReque
 
 
 def detection_of(options: CalibrationOptions) -> dict[str, Any]:
-    """Give the arguments of `calibrate_datasets` that say where the beads are."""
+    """Return the arguments of `calibrate_datasets` that locate the beads."""
     return {argument: options.get(name) for name, argument in OF_DETECTION.items()}

@@ -50,7 +50,7 @@ class DatasetFrames:
         return len(self._dataset)
 
     def look(self, detector: SpotFinder) -> list[FrameSpots]:
-        """Detect the beads of every frame."""
+        """Detect the beads of every frame, missing ones marked as such."""
         normalise = self._dataset.normalisation
 
         def one(index: int) -> FrameSpots:
@@ -63,7 +63,14 @@ class DatasetFrames:
         return self._each(one)
 
     def windows(self, plan: Windows) -> Float32Array:
-        """Cut the windows of every frame; only their pixels are normalised."""
+        """Cut the windows of every frame; only their pixels are normalised.
+
+        Args:
+            plan: corners and side of the windows.
+
+        Returns:
+            float32 (n, k, side, side), NaN outside images and in dead pixels.
+        """
         normalise = self._dataset.normalisation
         log_open = np.where(normalise.dead, np.float32(np.nan), normalise.log_open)
         n, k = plan.corner.shape[:2]
@@ -82,7 +89,7 @@ class DatasetFrames:
         return out
 
     def _counts(self, index: int) -> Counts | None:
-        """Counts of one frame, None if its file is missing or unreadable."""
+        """Return the counts of one frame, None if its file is missing or unreadable."""
         if index in self._kept:
             return self._kept[index]
         if not self._dataset.frames[index].present:

@@ -9,11 +9,11 @@ import numpy as np
 from flexdt.library.datasets.image_set import ImageSet
 
 STEPPED: Final = "step scan"
-"""How the scanner's settings text calls a scan that stops for every image."""
+"""Name in the scanner's settings text of a scan that stops for every image."""
 
 
 def exposure_share(data: ImageSet) -> float | None:
-    """Give the part of a step that the object turns while a frame is exposed.
+    """Return the part of a step that the object turns while a frame is exposed.
 
     A smooth scan turns on, so the part is that of the time between two frames. A scan that stops
     for every image turns by nothing.
@@ -22,7 +22,7 @@ def exposure_share(data: ImageSet) -> float | None:
         data: a scan with `flexdt.json` or the scanner's settings text.
 
     Returns:
-        From 0 to 1; None where neither says it.
+        From 0 to 1; None where neither states it.
     """
     document = data.document
     if document is None or "smooth" not in document.model_fields_set:

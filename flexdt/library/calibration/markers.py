@@ -1,9 +1,10 @@
 """Calibration from markers: marked by hand, found by another program, or of unknown positions.
 
-A file of markers says where each was seen in each frame. The columns of a CSV file are named in its
-first line: frame (counted from 0), marker, column, row and, if it is known, sigma [px]; a marker
-that was not seen has no line. A NumPy file holds (frames, markers, 2) pixels, nan where unseen.
-Pixel (0, 0) is the middle of the first one, row 0 is the upper one.
+A file of markers has the pixel of each in each frame. The columns of a CSV file are named
+in its first line: frame (counted from 0), marker, column, row and, if it is known, sigma
+[px]; a marker that was not seen has no line. A NumPy file holds (frames, markers, 2)
+pixels, nan where unseen. Pixel (0, 0) is the middle of the first one, row 0 is the upper
+one.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.projection.analytic_solids import Scene
 
 ASSUMED_PX: Final = 0.5
-"""Standard deviation of a marker's position where the file states none, assumed."""
+"""Assumed: standard deviation of a marker's position where the file states none [px]."""
 FAR_PX: Final = 1e5
 """A coordinate of a marker is at most so large [px]."""
 WIDEST_PX: Final = 1e4
@@ -59,12 +60,12 @@ NAMES: Final = {
     "column": ("column", "col", "x", "u"),
     "row": ("row", "y", "v"),
 }
-"""What the columns of a CSV file may be called."""
+"""Column of a CSV file -> names that it may have."""
 
 
 Mark = tuple[int, str, float, float, float | None]
-"""Where a marker was seen: frame (counted from 0), marker, column, row and sigma [px], None for
-`ASSUMED_PX`."""
+"""A marker's place in a frame: frame (counted from 0), marker, column, row and sigma
+[px], None for `ASSUMED_PX`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,10 +99,10 @@ class Scale:
 
     @classmethod
     def of(cls, text: str) -> Scale:
-        """A-B=MM, or A-B=MM+-SIGMA.
+        """Parse A-B=MM, or A-B=MM+-SIGMA.
 
         Raises:
-            TwinError: another form.
+            TwinError: the text has another form.
         """
         pair, _, size = text.rpartition("=")
         a, dash, b = pair.partition("-")
@@ -117,14 +118,14 @@ class Scale:
 
 
 def read_markers(source: str | PathLike[str] | Sequence[Mark], views: int) -> Markers:
-    """Markers of a CSV or NumPy file, or marks.
+    """Read the markers of a CSV or NumPy file, or collect given marks.
 
     Args:
         source: the file's path (.npy is a NumPy file, anything else a CSV file), or the marks.
         views: how many frames there are.
 
     Raises:
-        TwinError: the file cannot be read, or what is in it does not hold; says where.
+        TwinError: the file cannot be read or is invalid; names the line.
     """
     if not isinstance(source, str | PathLike):
         return _gathered((_mark(f"mark {i}", row) for i, row in enumerate(source)), views)
@@ -133,7 +134,15 @@ def read_markers(source: str | PathLike[str] | Sequence[Mark], views: int) -> Ma
 
 
 def _of_array(path: Path, views: int) -> Markers:
-    """Markers of a NumPy file: an array (views, markers, 2) of pixels, nan where unseen."""
+    """Read markers of a NumPy file.
+
+    Args:
+        path: of an array (views, markers, 2) of pixels, nan where unseen.
+        views: that the scan has.
+
+    Raises:
+        TwinError: unreadable, another shape, or pixels too far away.
+    """
     try:
         stored = np.load(path, allow_pickle=False)
         tracks = stored.astype(np.float64, casting="same_kind")
@@ -150,7 +159,15 @@ def _of_array(path: Path, views: int) -> Markers:
 
 
 def _of_table(path: Path, views: int) -> Markers:
-    """Markers of a CSV file whose first line names its columns."""
+    """Read markers of a CSV file whose first line names its columns.
+
+    Args:
+        path: of the file.
+        views: that the scan has.
+
+    Raises:
+        TwinError: unreadable, or a line that is invalid; names the line.
+    """
     try:
         rows = list(csv.reader(io.StringIO(read_text(path))))
     except csv.Error as error:
@@ -176,7 +193,7 @@ def _of_table(path: Path, views: int) -> Markers:
 
 
 def _mark(where: str, row: Mark) -> tuple[str, Mark]:
-    """A mark of whoever calls the library, with the types it should have; a number is a name."""
+    """Check and convert the types of a mark; a number becomes the marker's name."""
     try:
         frame, name, column, line, sigma = row
         stated = None if sigma is None else float(sigma)
@@ -187,7 +204,15 @@ def _mark(where: str, row: Mark) -> tuple[str, Mark]:
 
 
 def _gathered(marks: Iterable[tuple[str, Mark]], views: int) -> Markers:
-    """Marks, each with words for where it stands, as a table."""
+    """Collect marks into a table.
+
+    Args:
+        marks: each with its place in the source, for messages.
+        views: that the scan has.
+
+    Raises:
+        TwinError: a frame or sigma out of range, or a marker twice in one frame.
+    """
     seen: dict[tuple[int, str], tuple[float, float, float]] = {}
     for where, (frame, name, x, y, stated) in marks:
         sigma = ASSUMED_PX if stated is None else stated
@@ -213,10 +238,10 @@ def _gathered(marks: Iterable[tuple[str, Mark]], views: int) -> Markers:
 
 
 def seen_alone(data: Images, markers: Markers) -> tuple[list[Images], Markers]:
-    """Data set and markers of those frames in which any was marked.
+    """Return data set and markers of the frames in which a marker was marked.
 
     Raises:
-        TwinError: none was.
+        TwinError: no marker was marked.
     """
     some = np.flatnonzero(markers.seen.any(axis=1))
     if not len(some):
@@ -241,8 +266,15 @@ def calibrate_known(
 ) -> Calibration:
     """Calibrate from the marked beads of a phantom; marker "3" is its bead 3, counted from 0.
 
+    Args:
+        data: the scan.
+        markers: pixels of the beads.
+        phantom: whose beads are marked.
+        request: the parameters to estimate.
+
     Raises:
-        TwinError: a marker is no bead of the phantom, or two are the same one ("3" and "03").
+        TwinError: a marker is no bead of the phantom, or two name the same one ("3" and
+            "03").
     """
     beads = len(phantom.beads)
     odd = [n for n in markers.names if not n.isdecimal() or int(n) >= beads]
@@ -270,21 +302,21 @@ def calibrate_unknown(
 ) -> tuple[Calibration, dict[str, object]]:
     """Calibrate from three or more markers of unknown positions.
 
-    The markers define the object's frame: its height, turn and place on the axis (dO_y, alpha,
-    tau_x, tau_z) are what the request's start says. Images determine only the ratio of their scale
-    and the distance of the axis; one of these is needed besides: `scale`, a prior on dO_z, or dO_z
-    among what is free.
+    The markers define the object's frame: its height, turn and place on the axis (dO_y,
+    alpha, tau_x, tau_z) are those of the request's start. Images determine only the ratio
+    of their scale and the distance of the axis; one of these is needed too: `scale`, a
+    prior on dO_z, or dO_z among what is free.
 
     Args:
         data: geometry, and names.
         images: its frames, None for markers without images.
-        markers: where they are seen; None: found in the images.
-        request: what to estimate.
+        markers: their pixels; None: detected in the images.
+        request: the parameters to estimate.
         scale: a known distance of two of them.
-        detector: what spots to look for in the images.
+        detector: finds spots in the images.
 
     Returns:
-        The calibration, and what is said of the markers: names, positions and scale.
+        The calibration, and the document of the markers: names, positions and scale.
 
     Raises:
         TwinError: too few markers, or one that is seen from too few directions.
@@ -354,9 +386,15 @@ def calibrate_unknown(
 
 
 def _turning_back(found: Calibration, data: ImageSet, markers: Markers | None) -> Calibration:
-    """Refused where markers stand still, or where they fit twice as well if the stage turns back.
-    (Without perspective both ways of turning would fit, with each marker as far behind as before
-    the axis.)
+    """Add an error if markers do not move, or fit twice as well with the stage reversed.
+
+    Without perspective both directions would fit, with each marker as far behind the axis
+    as before.
+
+    Args:
+        found: the calibration.
+        data: the scan.
+        markers: their pixels; None checks nothing.
     """
     if markers is None or found.fit is None:
         return found
@@ -391,6 +429,16 @@ def _calibrated(
     request: CalibrationRequest,
     images: Frames | None = None,
 ) -> Calibration:
+    """Calibrate from spots whose beads are known.
+
+    Args:
+        data: the scan.
+        looks: spots of each frame.
+        index: (frames, beads) spot of each bead, -1 where unseen.
+        model: positions of the beads.
+        request: the parameters to estimate.
+        images: for a second detection; None: widths come from the markers' sigmas.
+    """
     priors = prior_widths(data.machine, data.profile)
     scan = Scan(
         SpotFrames(looks, images), data.poses, data.name, priors, index, exposure_share(data)
@@ -409,7 +457,7 @@ def _numbered(names: Sequence[str], name: str) -> int:
 
 
 def _radii(looks: Sequence[FrameSpots], index: Index, poses: Poses) -> FloatArray:
-    """Of the balls whose spots have the sizes seen [mm], (k,)."""
+    """Return the radii [mm] of balls whose spots have the observed sizes, (k,)."""
     scale = np.linalg.norm(poses.u, axis=1) * poses.sod / poses.sdd
     return np.array(
         [

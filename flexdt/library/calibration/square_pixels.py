@@ -19,11 +19,11 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 
 UNEQUAL = 1e-3
-"""Relative difference of the pixel's sides from which rows are taken anew."""
+"""Relative difference of the pixel's sides above which rows are resampled."""
 
 
 def squared(data: Images) -> Images:
-    """`data`, or where its pixels are not square the same with rows as far apart as its columns."""
+    """Return `data`, with rows resampled to the columns' pitch where pixels are not square."""
     poses = data.poses
     ratio = float(np.median(np.linalg.norm(poses.v, axis=1) / np.linalg.norm(poses.u, axis=1)))
     if abs(ratio - 1.0) < UNEQUAL:
@@ -49,7 +49,7 @@ def squared(data: Images) -> Images:
 
 @dataclass(frozen=True, eq=False)
 class ResampledRows:
-    """Counts of images whose rows are taken anew, `ratio` times as close.
+    """Counts of images with resampled rows, `ratio` times as close.
 
     Attributes:
         original: the images.
@@ -66,21 +66,21 @@ class ResampledRows:
     @overload
     def __getitem__(self, index: npt.NDArray[np.int64]) -> ResampledRows: ...
     def __getitem__(self, index: int | npt.NDArray[np.int64]) -> Counts | ResampledRows:
-        """Resample one image, or select several."""
+        """Return the resampled counts of one image, or select several."""
         if isinstance(index, np.ndarray) and index.ndim:
             return replace(self, original=self.original[index])
         counts = self.of(self.original.counts(int(index)))
         return np.rint(counts).clip(0, np.iinfo(np.uint16).max).astype(np.uint16)
 
     def flats(self) -> Float32Array | None:
-        """Resample the mean flat image, (1, rows, cols); None where there is none."""
+        """Return the resampled mean flat image, (1, rows, cols); None if there is none."""
         try:
             return self.of(self.original.flat)[None]
         except DatasetMissingError:
             return None
 
     def of(self, image: Counts | Float32Array) -> Float32Array:
-        """Average an image over the new rows, centred on the old ones.
+        """Compute means of an image over the new rows, centred on the old ones.
 
         Args:
             image: (old rows, cols).

@@ -1,7 +1,8 @@
 """`flexdt export` and `import` without their command line: data sets, files, geometries.
 
-The conversions are in `flexdt.twin.exchange`; this module reads and writes the files, each under
-its name only when whole. What a file does not state, such as the detector's size, is an argument.
+The conversions are in `flexdt.twin.exchange`; this module reads and writes the files,
+each under its name only when complete. Values that a file does not state, such as the
+detector's size, are arguments.
 """
 
 from __future__ import annotations
@@ -67,11 +68,11 @@ def __getattr__(name: str) -> Any:
 
 
 def geometry_of(dataset: ImageSet, parameters: Offsets | None = None) -> ScanGeometry:
-    """A data set's geometry.
+    """Return a data set's geometry.
 
     Args:
         dataset: from `load_dataset`.
-        parameters: correction; None is the one in force during the scan, if any.
+        parameters: correction; None: the correction in force during the scan, if any.
 
     Raises:
         ExchangeError: projections of several shapes.
@@ -103,7 +104,8 @@ def export_dataset(
         out: the file; its ending chooses where a format has several.
         format: one of `FORMATS`; nxtomo holds the images as well.
         parameters: correction; None is the one in force during the scan, if any.
-        real: what is so and a reconstruction does not know, for formats that tell (CTSimU).
+        real: true offsets that a reconstruction does not know, for formats with a place
+            for them (CTSimU).
         rows_up: the images are turned upside down before use: v upwards.
 
     Returns:
@@ -147,11 +149,11 @@ def import_geometry(
     Args:
         path: the file.
         format: one of `FORMATS` that is read (`Format.read`).
-        given: what the file does not say.
+        given: values that the file does not state.
         rows_up: its rows are counted upwards while the images have row 0 on top: v is negated.
 
     Raises:
-        ExchangeError: the file does not hold, or something is missing; says what.
+        ExchangeError: the file is invalid, or something is missing; names it.
         OSError: it cannot be read.
     """
     known = Given() if given is None else given
@@ -176,10 +178,10 @@ def import_geometry(
 
 
 def _examined(geometry: ScanGeometry, path: Path) -> ScanGeometry:
-    """The geometry of a file with what is doubtful about it among its notes.
+    """Add the doubts about a file's geometry to its notes.
 
     Raises:
-        ExchangeError: no scanner has it.
+        ExchangeError: no scanner has such a geometry.
     """
     found = examine(Operation.OPEN, geometry.cone_vec, geometry.shape)
     doubts = settled(found, ExchangeError, str(path))
@@ -187,7 +189,7 @@ def _examined(geometry: ScanGeometry, path: Path) -> ScanGeometry:
 
 
 def _known(format: str, allowed: Iterable[str]) -> Format:
-    """The format of that name, if it is among those allowed."""
+    """Return the format of a name, or raise ExchangeError unless it is allowed."""
     names = [*allowed]
     if format not in names:
         raise ExchangeError(
@@ -198,7 +200,9 @@ def _known(format: str, allowed: Iterable[str]) -> Format:
 
 
 def _to_write(out: Path, format: str, allowed: Iterable[str]) -> Format:
-    """The format of that name, if a file of it may be called so."""
+    """Return the format of a name, or raise ExchangeError where the file's ending is
+    another.
+    """
     form = _known(format, allowed)
     if out.suffix.lower() not in form.endings:
         raise ExchangeError(
@@ -251,7 +255,7 @@ def load_geometry(path: str | PathLike[str]) -> ScanGeometry:
 
 
 def with_geometry(dataset: Images, geometry: ScanGeometry | ConeVec | File) -> Images:
-    """The data set with its nominal geometry replaced; no correction is added to it.
+    """Return the data set with its nominal geometry replaced and no correction in force.
 
     Args:
         dataset: from `load_dataset`.

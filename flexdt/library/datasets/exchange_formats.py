@@ -1,6 +1,6 @@
 """Formats of other programs for geometry: names, endings, and the functions that write and read.
 
-`FORMATS` is the only list of them. The command line takes its choices from it before it imports
+`FORMATS` lists them once. The command line takes its choices from it before it imports
 anything heavy, so each function imports what it needs.
 """
 
@@ -33,11 +33,12 @@ class Format:
         name: of the format, as `--format` takes it.
         endings: of its files, in lower case.
         write: from a geometry and the path to the file's content; None: it takes a data set.
-        export: writes a data set (dataset, path, correction, what is so and unknown); None: its
-            geometry is written.
-        read: from a path and what its file does not say to a geometry; None: it is not read.
+        export: writes a data set (dataset, path, correction, true offsets unknown to a
+            reconstruction); None: its geometry is written.
+        read: from a path and values that its file does not state to a geometry; None: it
+            is not read.
         rows: where the format fixes it, the way in which rows are counted.
-        states_unknown: it tells what is so from what a reconstruction knows.
+        states_unknown: it separates true offsets from those that a reconstruction knows.
     """
 
     name: str
@@ -84,6 +85,9 @@ def _write_rtk(geometry: ScanGeometry, out: Path) -> Content:
 
 
 def _read_rtk(path: Path, given: Given) -> ScanGeometry:
+    """Read a geometry of RTK; raise ExchangeError if the file is invalid or the pitch
+    unknown.
+    """
     from flexdt.library.datasets.geometry_content import text_of
     from flexdt.twin.exchange.geometry import ExchangeError
     from flexdt.twin.exchange.rtk_xml import read_rtk
@@ -134,7 +138,7 @@ def _read_tomosipo(path: Path, given: Given) -> ScanGeometry:
 
 
 def _array_file(arrays: Mapping[str, Any]) -> bytes:
-    """The bytes of an .npz."""
+    """Return arrays as the bytes of an .npz."""
     import numpy as np
 
     buffer = io.BytesIO()
@@ -238,4 +242,4 @@ FORMATS: Final[Mapping[str, Format]] = {
         Format("nxtomo", (".nxs", ".nx", ".h5", ".hdf5"), export=_export_nxtomo, rows="down"),
     )
 }
-"""Name -> format, in the order in which they are listed."""
+"""Name -> format, in the order of listings."""

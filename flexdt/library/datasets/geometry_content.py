@@ -1,4 +1,4 @@
-"""Read what a geometry's file contains: its text, its arrays, and what is stated for it."""
+"""Read the contents of a geometry's file: text, arrays, and values given for it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MAX_BYTES: Final = 256 << 20
 
 @dataclass(frozen=True)
 class Given:
-    """What a file may not say of itself.
+    """Values that a geometry file may not state.
 
     Attributes:
         shape: detector (rows, cols).
@@ -32,12 +32,12 @@ class Given:
 
     @classmethod
     def of(cls, dataset: ImageSet) -> Given:
-        """The values of a data set of the same scan."""
+        """Take the values from a data set of the same scan."""
         pitch = ScanGeometry(dataset.cone_vec).pitch_mm
         return cls(dataset.shape, pitch, len(dataset))
 
     def check_pitch(self, geometry: ScanGeometry, path: Path) -> None:
-        """Raise ExchangeError if a file says another pitch."""
+        """Raise ExchangeError if a file states another pitch."""
         pitch = geometry.pitch_mm
         if self.pitch_mm is not None and not np.allclose(pitch, self.pitch_mm, rtol=1e-3):
             found, asked = (f"{u:g} x {v:g}" for u, v in (pitch, self.pitch_mm))
@@ -46,7 +46,7 @@ class Given:
 
 
 def text_of(path: Path) -> str:
-    """A file's UTF-8 text, or ExchangeError."""
+    """Return a file's UTF-8 text, or raise ExchangeError."""
     if path.stat().st_size > MAX_BYTES:
         raise ExchangeError(f"{path}: {path.stat().st_size} bytes; allowed: {MAX_BYTES}")
     try:
@@ -56,7 +56,9 @@ def text_of(path: Path) -> str:
 
 
 def arrays_of(path: Path) -> dict[str, np.ndarray[Any, np.dtype[Any]]]:
-    """The arrays of an .npz, or the one of an .npy as `array`; ExchangeError if it is neither."""
+    """Return the arrays of an .npz, or the array of an .npy as `array`; else raise
+    ExchangeError.
+    """
     try:
         loaded = np.load(path, allow_pickle=False)
         if isinstance(loaded, np.ndarray):

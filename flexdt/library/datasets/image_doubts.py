@@ -20,12 +20,12 @@ MAX_FROM_DISK: Final = 32
 RADIOGRAPHS: Final = "radiographs"
 FLAT_IMAGE: Final = "flat image"
 SATURATED: Final = "are saturated, where attenuation comes out wrong"
-"""What every sentence of saturated images holds."""
+"""Words that every sentence about saturated images contains."""
 DARK: Final = "no pixel of the flat images is brighter than the dark ones: was the tube off?"
 
 
 def saturated_part(what: str, share: float) -> str:
-    """Say which part of some images' pixels is saturated, and what would do.
+    """Make the sentence on the saturated part of some images, with its remedy.
 
     Args:
         what: which images.
@@ -38,12 +38,13 @@ def saturated_part(what: str, share: float) -> str:
 
 
 def first_look(paths: Mapping[str, Path], full_scale: int | None) -> list[str]:
-    """Say whether images are saturated, before anything is computed of them.
+    """Check images for saturation before anything is computed from them.
 
     Args:
-        paths: one image of each kind, which the sentence names. One that cannot be read is passed
-            over: whoever reads it is told.
-        full_scale: largest count of the panel; None where it is not known, and nothing is said.
+        paths: one image of each kind, which the sentence names. An unreadable image is
+            skipped; reading it later is an error.
+        full_scale: largest count of the panel; None where it is not known: nothing is
+            checked.
 
     Returns:
         At most one sentence, of the first kind that is saturated.
@@ -63,17 +64,18 @@ def first_look(paths: Mapping[str, Path], full_scale: int | None) -> list[str]:
 def image_doubts(
     scan: ImageSet, *, needed: bool = False, counts: Callable[[int], Counts] | None = None
 ) -> list[str]:
-    """Find what in the exposure of a scan's images makes its line integrals doubtful.
+    """Find saturated or starved pixels that make a scan's line integrals doubtful.
 
-    Saturated pixels are those with the panel's largest count. Where that is not known, it is the
-    largest among the images if it is one at which converters end (2^bits - 1). All radiographs in
-    memory are looked at, `MAX_FROM_DISK` of those in files, and the flat image.
+    Saturated pixels are those with the panel's largest count. Where that is not known, it
+    is the largest among the images if it is one at which converters end (2^bits - 1). All
+    radiographs in memory are examined, `MAX_FROM_DISK` of those in files, and the flat
+    image.
 
     Args:
         scan: the data set.
         needed: line integrals are.
-        counts: gives those of a frame in a file by its index; None reads them. Pixels that the data
-            set interpolates are not looked at.
+        counts: gives those of a frame in a file by its index; None reads them. Pixels
+            that the data set interpolates are skipped.
 
     Raises:
         DatasetFormatError: line integrals are `needed`, and the images hold none: no pixel of the

@@ -1,7 +1,8 @@
 """The images of a scan as a value: frames read on demand or held in memory, with their geometry.
 
-`ImageSet` is what calibration, alignment, reconstruction and the writers of files take. Users meet
-it as `DataSet` (`flexdt.library.data_set`), which adds a method for each of these.
+`ImageSet` is the input of calibration, alignment, reconstruction and the writers of
+files. Users meet it as `DataSet` (`flexdt.library.data_set`), which adds a method for
+each of these.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ OPEN_COUNTS: Final = 60_000.0
 FEWEST_COUNTS: Final = 25
 """Largest count of an image below which it is doubtful that these are counts."""
 Images = TypeVar("Images", bound="ImageSet")
-"""An image set of the kind that was given, such as a `DataSet`."""
+"""An image set of the caller's kind, such as a `DataSet`."""
 Images_co = TypeVar("Images_co", bound="ImageSet", covariant=True)
 """The same in results."""
 
@@ -61,8 +62,8 @@ class Arrays:
     Attributes:
         counts: uint16 (n, rows, cols); None where they are files.
         darks, flats: (k, rows, cols), or None where there are none.
-        integrals: line integrals (n, rows, cols) of which counts were made; None where counts were
-            measured.
+        integrals: line integrals (n, rows, cols) from which counts were made; None for
+            measured counts.
     """
 
     counts: Counts | CountsReader | None
@@ -71,7 +72,7 @@ class Arrays:
     integrals: Float32Array | None = None
 
     def of_views(self, chosen: npt.NDArray[np.int64]) -> Arrays:
-        """Those of some of the images."""
+        """Select the arrays of some of the images."""
         if self.counts is None:
             return self
         kept = None if self.integrals is None else self.integrals[chosen]
@@ -90,21 +91,21 @@ class ImageSet:
         name: the scan's.
         frames: all projections the scan should have, in order; `present` says which are there.
         shape: image (rows, cols) of the first projection.
-        cone_vec: nominal, uncorrected geometry of `frames`: what the file says, or the texts give.
+        cone_vec: nominal, uncorrected geometry of `frames`, from the file or the texts.
         correction: in force during the scan, or given since: in `geometry`, not in `cone_vec`.
-        folder: where it lies, None in memory.
+        folder: its folder, None in memory.
         darks, flats: paths of the dark and flat images that are there.
         arrays: the images, where they are in memory.
         nominal: nominal poses of `frames`; None where `cone_vec` is all that is known.
         positions: motor -> (n,) positions of `frames` [mm, deg], script's sign.
-        machine, profile: what the poses come from; None for an unknown scanner.
+        machine, profile: from which the poses follow; None for an unknown scanner.
         settings: the scanner's text, None if there is none.
         document: flexdt.json, None if there is none.
-        complete: whether the scan says it finished and no file is missing.
+        complete: whether the scan reports its end and no file is missing.
         reason: why it is not complete.
-        warnings: what is doubtful.
+        warnings: doubts about the data set.
         full_scale: largest count of the panel; None where it is not known.
-        truth: of a simulated data set, what lies behind it.
+        truth: of a simulated data set, its sample and settings.
         interpolated: pixels whose line integrals are interpolated, (rows, cols); None: dead ones.
 
     Example:
@@ -151,21 +152,22 @@ class ImageSet:
         warnings: Sequence[str] = (),
         truth: Any = None,
     ) -> Self:
-        """A data set in memory.
+        """Make a data set in memory.
 
         Args:
-            counts: (n, rows, cols), whole numbers from 0 to 65535; with a flat image also images
-                of any other scale, such as floats, or what lies below 0 after a dark image was
-                subtracted; or line integrals, which are floats without a flat image. Line
-                integrals are kept as they are, and as counts of an open beam of 60000, or down to
-                20000 where pixels are brighter than it, for what takes counts; a warning says how
-                many are beyond what counts hold.
+            counts: (n, rows, cols), integers from 0 to 65535; with a flat image also
+                images of any other scale, such as floats, or negative values after a dark
+                image was subtracted; or line integrals, which are floats without a flat
+                image. Line integrals are kept as they are, and as counts of an open beam
+                of 60000, or down to 20000 where pixels are brighter than it, for
+                functions of counts; a warning gives the number beyond the range of
+                counts.
             geometry: one view for each image.
             dark, flat: (rows, cols), or several images (k, rows, cols), of which the mean is taken.
                 Without a flat image, counts have no line integrals.
             name: of the data set.
-            warnings: what is doubtful about it.
-            truth: what lies behind a simulation.
+            warnings: doubts about it.
+            truth: sample and settings of a simulation.
 
         Raises:
             DatasetFormatError: shapes that do not fit, or values that are no counts.
@@ -230,7 +232,7 @@ class ImageSet:
         return f"<DataSet {self.name!r}: {images}, {state}{doubts}>"
 
     def _repr_html_(self) -> str:
-        """Show what a reader wants to know first, and the first image."""
+        """Show a table of the data set's figures, and the first image."""
         rows, cols = self.shape
         facts = {
             "projections": f"{len(self)} of {rows} x {cols} pixels",
@@ -251,7 +253,11 @@ class ImageSet:
     def __getitem__(
         self, index: int | slice | Sequence[int] | npt.NDArray[Any]
     ) -> Float32Array | Self:
-        """Line integrals of one projection, or the data set of several."""
+        """Return line integrals (rows, cols) of one projection, or the data set of several.
+
+        Args:
+            index: of a projection, or a slice or indices of several.
+        """
         if not isinstance(index, slice) and np.ndim(index) == 0:
             return self.line_integrals(whole(index))  # type: ignore[arg-type]
         chosen = np.arange(len(self))[index]
@@ -269,12 +275,12 @@ class ImageSet:
         )
 
     def __iter__(self) -> Iterator[Float32Array]:
-        """Line integrals, one projection after the other."""
+        """Iterate over line integrals (rows, cols), one projection after the other."""
         return (self.line_integrals(i) for i in range(len(self)))
 
     @property
     def where(self) -> str:
-        """The folder, or the name of what is in memory, for messages."""
+        """The folder, or the name of a data set in memory, for messages."""
         return self.name if self.folder is None else str(self.folder)
 
     @property
@@ -289,10 +295,10 @@ class ImageSet:
 
     @cached_property
     def poses(self) -> Poses:
-        """Nominal poses of `frames`; where motors are not known, those that `cone_vec` tells.
+        """Nominal poses of `frames`; where motors are not known, those that `cone_vec` implies.
 
         Raises:
-            GeometryError: a panel that stands on its side, so that the stage's angle is not told.
+            GeometryError: a panel on its side, so that the stage's angle is unknown.
         """
         return Poses.from_cone_vec(self.cone_vec) if self.nominal is None else self.nominal
 
@@ -308,7 +314,7 @@ class ImageSet:
         return self.corrected().with_shape(self.shape if alike else None)
 
     def corrected(self, parameters: Offsets | None = None) -> ConeVec:
-        """Geometry of `frames` with a correction applied.
+        """Return the geometry of `frames` with a correction applied.
 
         Args:
             parameters: offsets to add; default: the correction in force, or none.
@@ -328,8 +334,8 @@ class ImageSet:
         return self.poses.cone_vec(parameters)
 
     def with_correction(self, correction: NamedCorrection | Offsets | None) -> Self:
-        """The same data set with another correction in force, such as `calibrate(...).correction`;
-        None for the nominal geometry.
+        """Return the data set with another correction in force, such as
+        `calibrate(...).correction`; None for the nominal geometry.
 
         Example:
             >>> import numpy as np
@@ -349,7 +355,7 @@ class ImageSet:
         return None if self.correction is None else self.correction.panel
 
     def with_motion(self, motion: Motion) -> Self:
-        """The same data set with a motion of scanner or sample in its geometry.
+        """Return the data set with a motion of scanner or sample in its geometry.
 
         Raises:
             TwinError: the motion has another number of frames.
@@ -367,7 +373,7 @@ class ImageSet:
         return replace(self, nominal=motion.applied(self.poses))
 
     def counts(self, index: int | None = None) -> Counts:
-        """Projections as they were measured.
+        """Read projections as they were measured.
 
         Args:
             index: of one projection; None for all.
@@ -402,7 +408,7 @@ class ImageSet:
 
     @cached_property
     def dark(self) -> Float32Array:
-        """Mean of the dark images, (rows, cols); zero, with a warning, if there is none."""
+        """Mean of the dark images, (rows, cols); zero, with a warning, without any."""
         dark = self._mean(self.darks, None if self.arrays is None else self.arrays.darks)
         return np.zeros(self.shape, dtype=np.float32) if dark is None else dark
 
@@ -411,7 +417,7 @@ class ImageSet:
         """Mean of the flat images, (rows, cols).
 
         Raises:
-            DatasetMissingError: there is none.
+            DatasetMissingError: there is no flat image.
         """
         flat = self._mean(self.flats, None if self.arrays is None else self.arrays.flats)
         if flat is None:
@@ -434,8 +440,9 @@ class ImageSet:
         return plain if self.interpolated is None else plain.interpolating(self.interpolated)
 
     def line_integrals(self, index: int | None = None) -> Float32Array:
-        """Projections as -log((p - d) / (f - d)), always finite; the panel's distortion and lag are
-        undone where the correction in force has some (lag where the frame before is there).
+        """Compute projections as -log((p - d) / (f - d)), always finite; the panel's
+        distortion and lag are undone where the correction in force has some (lag where
+        the frame before is there).
 
         Args:
             index: of one projection; None for all.
@@ -466,14 +473,16 @@ class ImageSet:
         return self.panel.undistorted(image)
 
     def _recorded(self, index: int) -> Float32Array:
-        """Line integrals of one projection as they were recorded or given, (rows, cols)."""
+        """Return line integrals of one projection as they were recorded or given, (rows,
+        cols).
+        """
         arrays = self.arrays
         if arrays is None or arrays.integrals is None:
             return self.normalisation(self.counts(index))
         return np.array(arrays.integrals[index])
 
     def stack(self, indices: Sequence[int] | None = None) -> Float32Array:
-        """Line integrals of several projections (default: all that are there), (n, rows, cols).
+        """Return line integrals of several projections (default: all present), (n, rows, cols).
 
         Example:
             >>> import numpy as np
@@ -490,10 +499,10 @@ class ImageSet:
         return out
 
     def require_complete(self) -> Self:
-        """This data set if it is complete.
+        """Return this data set if it is complete.
 
         Raises:
-            DatasetMissingError: says what is missing.
+            DatasetMissingError: lists the missing files.
 
         Example:
             >>> import numpy as np
@@ -512,7 +521,7 @@ class ImageSet:
 
 
 def _are_counts(values: npt.NDArray[Any]) -> bool:
-    """Whether values are whole numbers from 0 to 65535."""
+    """Check whether values are integers from 0 to 65535."""
     if values.dtype == np.uint16:
         return True
     top = np.iinfo(np.uint16).max
@@ -522,7 +531,7 @@ def _are_counts(values: npt.NDArray[Any]) -> bool:
 def _normalised(
     values: npt.NDArray[Any], dark: npt.ArrayLike | None, flat: npt.ArrayLike
 ) -> Float32Array:
-    """Line integrals of images that are no counts, by their dark and flat images."""
+    """Compute line integrals of images that are no counts, by their dark and flat images."""
     shape = values.shape[1], values.shape[2]
     darks, flats = _several("dark", dark, shape), _several("flat", flat, shape)
     opened = np.zeros(shape) if flats is None else flats.mean(axis=0)
@@ -530,7 +539,9 @@ def _normalised(
 
 
 def _blank(counts: Counts) -> npt.NDArray[np.bool_]:
-    """Which images (n, rows, cols) are zero everywhere; pixels of one row decide for most."""
+    """Mark images (n, rows, cols) that are zero everywhere; pixels of one row decide for
+    most.
+    """
     blank: npt.NDArray[np.bool_] = counts[:, counts.shape[1] // 2, ::41].max(axis=1) == 0
     for i in np.flatnonzero(blank):
         blank[i] = not counts[i].any()
@@ -538,7 +549,11 @@ def _blank(counts: Counts) -> npt.NDArray[np.bool_]:
 
 
 def _counts_of(integrals: npt.NDArray[Any]) -> tuple[Counts, float, list[str]]:
-    """Line integrals as counts, the open beam's count, and how many do not fit into them.
+    """Convert line integrals to counts.
+
+    Returns:
+        Counts (n, rows, cols), the open beam's count, and a warning if values exceed
+        their range.
 
     Raises:
         DatasetFormatError: line integrals that are not finite.
@@ -563,7 +578,7 @@ def _counts_of(integrals: npt.NDArray[Any]) -> tuple[Counts, float, list[str]]:
 def _several(
     what: str, images: npt.ArrayLike | None, shape: tuple[int, int]
 ) -> npt.NDArray[Any] | None:
-    """One or several images as (k, rows, cols)."""
+    """Return one or several images as (k, rows, cols), None without any."""
     if images is None:
         return None
     values = np.asarray(images)
@@ -577,7 +592,7 @@ def _several(
 
 
 def flats_of(data: ImageSet) -> npt.NDArray[Any]:
-    """The flat images, (k, rows, cols); of one alone none is read."""
+    """Return the flat images, (k, rows, cols); a single file is not read."""
     if data.arrays is not None and data.arrays.flats is not None:
         return data.arrays.flats
     several = data.flats if len(data.flats) > 1 else ()
@@ -585,7 +600,7 @@ def flats_of(data: ImageSet) -> npt.NDArray[Any]:
 
 
 def references(data: ImageSet) -> list[tuple[str, Counts]]:
-    """Dark and flat images with their names; means that are no whole numbers are rounded."""
+    """List dark and flat images with their names; means that are no integers are rounded."""
     if data.arrays is None:
         return [(path.name, read_image(path)) for path in (*data.darks, *data.flats)]
     kinds = (("di", data.arrays.darks), ("io", data.arrays.flats))

@@ -47,7 +47,7 @@ def thumbnail(image: npt.NDArray[Any], alt: str) -> str:
 
     Args:
         image: every so many pixels of it are drawn, so that no side exceeds THUMBNAIL_PX.
-        alt: says what is seen.
+        alt: description of the image.
     """
     from flexdt.library.datasets.pictures import png
 

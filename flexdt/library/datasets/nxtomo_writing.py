@@ -1,7 +1,7 @@
 """Write NeXus's NXtomo (application definition 2.0).
 
-It holds raw counts with image keys, in HDF5. It knows a rotation angle and little else of a cone
-beam, so the rows of cone_vec stand beside it, in a group that readers of NXtomo pass over.
+It holds raw counts with image keys, in HDF5. NXtomo has a rotation angle and little else
+of a cone beam, so a further group, which its readers skip, holds the rows of cone_vec.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ PROJECTION, FLAT, DARK = 0, 1, 2
 """Image keys of NXtomo."""
 INVALID: Final = 3
 HALF_SEEN: Final = 0.5
-"""Share of the panel's longer side of the rotation axis that its shorter one has, below which the
-field of view is half: the views of a whole turn complete each other."""
+"""Ratio of the panel's parts on both sides of the rotation axis (shorter over longer)
+below which the field of view is half: the views of a full turn complete each other."""
 KEYS: Final = {"di": DARK, "io": FLAT}
-"""Image keys of what the scanner calls so."""
+"""Beginning of the scanner's file names -> image key."""
 BYTES_A_PIXEL: Final = 2
 """Of counts, uint16."""
 
 
 def save_nxtomo(data: ImageSet, file: File) -> None:
-    """See `DataSet.to_nxtomo`."""
+    """Write a data set to an NXtomo file; see `DataSet.to_nxtomo`."""
     h5py = package("h5py", "to_nxtomo")
     if any(frame.shape != data.shape for frame in data.frames):
         raise DatasetFormatError(
@@ -44,6 +44,7 @@ def save_nxtomo(data: ImageSet, file: File) -> None:
 
 
 def _write(data: ImageSet, out: Any) -> None:
+    """Write a data set into an open HDF5 file: counts, keys, angles, exposure and cone_vec."""
     geometry = data.geometry
     before = references(data)
     count = len(before) + len(data)
@@ -98,7 +99,7 @@ def _write(data: ImageSet, out: Any) -> None:
 
 
 def _field_of_view(axis_column: float, columns: int) -> str:
-    """`Full`, or `Half` where the rotation axis is seen near a side of the panel."""
+    """Return `Full`, or `Half` where the rotation axis is near a side of the panel."""
     left, right = axis_column + 0.5, columns - 0.5 - axis_column
     return "Half" if min(left, right) < HALF_SEEN * max(left, right) else "Full"
 
@@ -107,8 +108,14 @@ def _write_exposure(data: ImageSet, keys: list[int], entry: Any, instrument: Any
     """Write tube and exposure, as far as they are known: count_time, energies, and the current of
     each image as its monitor (`control`).
 
-    A tube has no one energy: `incident_energy` is the mean of flexdt's own spectrum, and the
-    source's energy is the end of it.
+    A tube has a spectrum: `incident_energy` is the mean of flexdt's own spectrum, and the
+    source's energy is its end.
+
+    Args:
+        data: the data set.
+        keys: image key of each image.
+        entry: group of the scan.
+        instrument: group in it.
     """
     kV, power_W, exposure_ms = _exposure_of(data)
     count = len(keys)
@@ -137,7 +144,7 @@ def _write_exposure(data: ImageSet, keys: list[int], entry: Any, instrument: Any
 
 
 def _exposure_of(data: ImageSet) -> tuple[float | None, float | None, float | None]:
-    """Voltage [kV], power [W] and exposure of one image [ms], None where nothing says them."""
+    """Return voltage [kV], power [W] and exposure of one image [ms], None where unknown."""
     if data.settings is not None:
         return data.settings.kV, data.settings.power_W, data.settings.exposure_ms
     exposure = None if data.truth is None else data.truth.exposure

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 PERCENTILES: Final = (0.5, 99.5)
-"""Grey values of a picture: these percentiles of the image become black and white."""
+"""Percentiles of an image that become black and white."""
 
 
 MARKS: Final = (
@@ -21,8 +21,8 @@ MARKS: Final = (
     (2, (48, 112, 255), "blue", "starved: hardly a count above dark"),
     (4, (255, 200, 0), "yellow", "edge at which the sample is cut off"),
 )
-"""Bits of a pixel's mark, each with its colour (red, green, blue), the colour's name and what it
-means."""
+"""Bits of a pixel's mark, each with its colour (red, green, blue), the colour's name and
+the mark's meaning."""
 PNG_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
 PNG_GREY, PNG_COLOUR = 0, 2
 """Colour types of a PNG: grey, and red, green and blue."""
@@ -31,13 +31,15 @@ PNG_FILTER_UP: Final = 2
 PNG_EFFORT: Final = 3
 """Of zlib, 0 to 9: more takes longer and saves a few per cent."""
 BAND: Final = 100
-"""Marks on the edge are drawn 1 / BAND of the picture wide, so that they can be seen."""
+"""Marks on the edge are drawn 1 / BAND of the picture wide, to be visible."""
 
 
 def windowed(
     image: npt.NDArray[Any], like: npt.NDArray[Any] | None = None
 ) -> npt.NDArray[np.uint8]:
-    """8-bit view of an image: percentiles, of `like` if given, to black and white; NaN is black."""
+    """Convert an image to 8 bits: percentiles, of `like` if given, to black and white;
+    NaN is black.
+    """
     seen = image if like is None else like
     seen = seen[np.isfinite(seen)]
     low, high = np.percentile(seen, PERCENTILES) if seen.size else (0.0, 0.0)
@@ -48,7 +50,9 @@ def windowed(
 
 
 def coloured(grey: npt.NDArray[np.uint8], marks: npt.NDArray[np.generic]) -> npt.NDArray[np.uint8]:
-    """A grey picture (rows, cols) with its marked pixels in colour, (rows, cols, 3) red first."""
+    """Draw the marked pixels of a grey picture (rows, cols) in colour, (rows, cols, 3)
+    red first.
+    """
     picture = np.repeat(grey[:, :, None], 3, axis=2)
     values = np.asarray(marks, dtype=np.uint8)
     for bit, colour, *_ in MARKS:
@@ -71,7 +75,7 @@ def _inward(edge: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
 
 
 def legend(marks: npt.NDArray[np.generic]) -> list[str]:
-    """What the colours of a picture mean, for those that occur in it."""
+    """List the meanings of the colours that occur in a picture."""
     values = np.asarray(marks, dtype=np.uint8)
     lines = []
     for bit, _, name, what in MARKS:

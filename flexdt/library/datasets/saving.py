@@ -39,7 +39,16 @@ REFERENCES: Final = ("di", "io")
 
 
 def save_data_set(data: ImageSet, folder: File, resume: bool = False) -> None:
-    """See `DataSet.save`."""
+    """Write a data set into a folder; see `DataSet.save`.
+
+    Args:
+        data: the data set.
+        folder: new or empty.
+        resume: continue an interrupted saving.
+
+    Raises:
+        DatasetExistsError: the folder has other files.
+    """
     path = Path(folder)
     path.mkdir(parents=True, exist_ok=True)
     there = {entry.name for entry in path.iterdir()}
@@ -64,8 +73,8 @@ def save_data_set(data: ImageSet, folder: File, resume: bool = False) -> None:
 
 
 def _content_of(data: ImageSet) -> dict[str, object]:
-    """Say what a folder will hold: name, number of projections, shape, and a digest of the geometry
-    and of the first projection, by which the same data set is known again.
+    """Return the content that a folder will hold: name, number of projections, shape, and
+    a digest of the geometry and of the first projection, which identifies the data set.
     """
     digest = hashlib.sha256(np.ascontiguousarray(data.geometry.rows).tobytes())
     if data.present:
@@ -81,10 +90,16 @@ def _content_of(data: ImageSet) -> dict[str, object]:
 def _require_room_for(
     path: Path, there: Collection[str], content: Mapping[str, object], resume: bool
 ) -> None:
-    """Check that a folder is empty, or that the same data set was interrupted in it.
+    """Check that a folder is empty, or that saving the same data set was interrupted in it.
+
+    Args:
+        path: the folder.
+        there: names in it.
+        content: of `_content_of`.
+        resume: continue an interrupted saving.
 
     Raises:
-        DatasetExistsError: says what the folder holds, and what is allowed.
+        DatasetExistsError: names the content of the folder, and the allowed cases.
     """
     if not there:
         return
@@ -100,7 +115,7 @@ def _require_room_for(
 
 
 def unfinished(path: Path) -> str:
-    """Say what a folder holds whose saving was interrupted.
+    """Describe a folder in which saving was interrupted.
 
     Args:
         path: of a folder with the file `UNFINISHED`.
@@ -113,7 +128,7 @@ def unfinished(path: Path) -> str:
 
 
 def _noted(path: Path) -> Mapping[str, object]:
-    """Read what the folder was to hold; nothing where the file is damaged."""
+    """Read the content that the folder was to hold; empty where the file is damaged."""
     try:
         noted = json.loads((path / UNFINISHED).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -122,11 +137,12 @@ def _noted(path: Path) -> Mapping[str, object]:
 
 
 def stated_settings(data: ImageSet) -> ScanSettings | None:
-    """What the scanner's texts say of a data set in memory.
+    """Return the settings in the scanner's texts of a data set in memory.
 
     Returns:
-        None where they cannot say its geometry: they know one circle in the plane of the sample's
-        reference point, with equal steps and an upright panel of square pixels.
+        None where they cannot express its geometry: they have one circle in the plane of
+        the sample's reference point, with equal steps and an upright panel of square
+        pixels.
     """
     geometry, shape = data.geometry, data.shape
     try:
@@ -163,7 +179,7 @@ def stated_settings(data: ImageSet) -> ScanSettings | None:
 
 
 def _geometry(data: ImageSet) -> tuple[str, bytes]:
-    """The file that says the geometry: the document as it was, or the geometry by itself."""
+    """Return name and bytes of the geometry's file: the document as it was, or the geometry."""
     files = tuple(frame.file for frame in data.frames)
     document = data.document
     moved = data.nominal is not None and not np.allclose(
