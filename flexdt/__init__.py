@@ -2,10 +2,11 @@
 
     import flexdt as fx
 
-Every public name is here, and each is found on first use: `import flexdt` itself loads none of the
-heavy libraries. To add a name, write it in `_HOMES` and among the imports for type checkers; a test
-compares the two and asks each name for a docstring with an example. Whatever else is here begins
-with an underscore, so that completers show the public names alone.
+Every public name is here, and each is found on first use: `import flexdt` itself loads
+none of the heavy libraries. To add a name, write it in `_HOMES` and among the imports for
+type checkers; a test compares the two and checks each name for a docstring with an
+example. All other names begin with an underscore, so that completers show only the public
+ones.
 """
 
 import typing as _typing

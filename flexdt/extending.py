@@ -1,4 +1,5 @@
-"""What other distributions write commands and files with; flexdt's own extensions do.
+"""Building blocks of commands and file formats in other distributions, such as flexdt's
+extensions.
 
 A command is a function whose parameters' defaults are its options; it yields lines for people and,
 once, the document of `--json`. The entry point group `flexdt.commands` gives it a name:

@@ -1,7 +1,7 @@
-"""What benchmarks and kernels of other distributions take from below the public functions.
+"""Kernels, threads and devices for benchmarks and kernels of other distributions.
 
-Devices, threads, the kernels themselves; and `parallel`, which compiles a function with `prange`
-as our own: it survives a fork, and its threads sleep while they wait.
+`parallel` compiles a function with `prange` like our own kernels: it survives a fork, and
+its threads sleep while they wait.
 
 Kernels change with every version; a program that imports them is written for one.
 """

@@ -1,4 +1,4 @@
-"""HTML pages of a dry run, and of an executed script beside its prediction.
+"""HTML pages of a dry run, and of an executed script compared with its prediction.
 
 The page shows the verdict, each problem with its line, the figures, every step with its start,
 duration and effect, and the clearance over time as a plot.
@@ -35,7 +35,7 @@ def html_report(report: CheckReport, name: str = "script") -> str:
 
     Args:
         report: from `check_script`.
-        name: what to call the script.
+        name: of the script.
     """
     title = f"Dry run of {name}"
     verdict = marked("ok", "good") if report.ok else marked("not ok", "bad")
@@ -51,11 +51,11 @@ def html_report(report: CheckReport, name: str = "script") -> str:
 
 
 def against_html(found: LogComparison, name: str = "script") -> str:
-    """Make one self-contained HTML page of predicted beside executed.
+    """Make one self-contained HTML page that compares the prediction with the execution.
 
     Args:
         found: the comparison.
-        name: what to call the script.
+        name: of the script.
     """
     title = f"{name}: predicted and executed"
     rows = table(found.HEADER, found.table(), text=("what",))
@@ -79,7 +79,7 @@ def clearance_plot(found: Clearance) -> str:
 
 
 def printable(text: str) -> str:
-    """Replace what cannot be printed by dots, and the ends of lines by their own."""
+    """Replace unprintable characters by dots, and keep only plain line ends."""
     lines = text.replace("\r\n", "\n")
     return "".join(c if c.isprintable() or c in "\n\t" else "·" for c in lines)
 
@@ -106,6 +106,7 @@ def _clearance(found: Clearance | None) -> list[str]:
 
 
 def _steps(report: CheckReport) -> list[str]:
+    """Make the HTML table of steps: line, start and duration [s], range, and effect."""
     timing = report.plan.machine.timing
     rows = [
         (

@@ -19,7 +19,7 @@ __all__ = ["Forecast", "Measured", "Transmission", "expose", "exposure_of"]
 
 @dataclass(frozen=True)
 class Measured:
-    """The same figures of a scan that was made; see `Forecast`.
+    """Figures of exposure of a recorded scan; see `Forecast`.
 
     `saturated` is None where the panel's largest count is not known.
     """
@@ -31,7 +31,7 @@ class Measured:
 
 
 def exposure_of(data: DataSet | str | PathLike[str]) -> Measured:
-    """Transmission, saturated and starved pixels of a scan's radiographs.
+    """Measure transmission, saturated and starved pixels of a scan's radiographs.
 
     Args:
         data: a data set or its folder.

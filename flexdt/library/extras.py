@@ -1,4 +1,4 @@
-"""Packages that extras of flexdt install, and what its extensions add."""
+"""Packages that extras of flexdt install, and functions of its extensions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ DISTRIBUTION: Final = "flexdt-extensions"
 def package(
     name: str, what: str = "this format", extra: str = "io", distribution: str = "flexdt"
 ) -> Any:
-    """The package or module `name` of a distribution's extra, which `what` needs.
+    """Import the package or module `name` of a distribution's extra, which `what` needs.
 
     Raises:
         TwinError: it is not installed.
@@ -30,7 +30,8 @@ def package(
 
 
 def lacking(module: str, name: str, extra: str) -> str | None:
-    """What to install for a module that is not there; None where it is. Imports nothing.
+    """Return the install hint for a missing module; None where it is installed. Imports
+    nothing.
 
     Args:
         module: as it is imported.
@@ -41,14 +42,14 @@ def lacking(module: str, name: str, extra: str) -> str | None:
 
 
 def offered(name: str, group: str) -> Any:
-    """What an installed distribution offers under an entry point, or None."""
+    """Load the object of an entry point of an installed distribution, or return None."""
     for point in entry_points(group=group, name=name):
         return point.load()
     return None
 
 
 def extension(name: str, what: str, group: str = "flexdt.extensions") -> Any:
-    """What `flexdt-extensions` offers under an entry point, which `what` needs.
+    """Load an entry point of `flexdt-extensions`, which `what` needs.
 
     Raises:
         TwinError: the distribution is not installed.

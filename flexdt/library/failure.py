@@ -1,4 +1,4 @@
-"""The error of a command that cannot do what was asked: lines for the user and an exit code."""
+"""The error of a command that fails: lines for the user and an exit code."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from collections.abc import Iterable
 
 
 class CommandError(Exception):
-    """A command cannot do what was asked.
+    """A command fails.
 
     Attributes:
-        lines: what to print, at least one line.
+        lines: to be printed, at least one.
         exit_code: of the table in docs/command-line.md; 1 is invalid input.
     """
 

@@ -32,7 +32,7 @@ COLOURS = ("#1b6ca8", "#c8553d", "#3a7d44", "#8e5ea2", "#b58900", "#17889b", "#9
 MARK = "#c62828"
 Floats = npt.NDArray[np.float64]
 DPI = 72.0
-"""Sizes below are in pixels, which at 72 dpi are also matplotlib's points."""
+"""Resolution at which pixels, the unit of the sizes below, are matplotlib's points."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ def require_plots() -> None:
 
 
 def blank(width: float, height: float) -> Figure:
-    """An empty figure [px] that belongs to no window."""
+    """Make an empty figure [px] that belongs to no window."""
     require_plots()
     from matplotlib.figure import Figure
 
@@ -63,7 +63,7 @@ def blank(width: float, height: float) -> Figure:
 
 
 def svg(figure: Figure) -> str:
-    """A figure as an SVG element, to be put into a page or a file of its own."""
+    """Render a figure as an SVG element, for a page or a file of its own."""
     import matplotlib as mpl
 
     text = io.StringIO()
@@ -91,9 +91,9 @@ def plot(
     """Draw lines and dots over two axes, as an SVG element.
 
     Args:
-        series: what is drawn; points that are not finite are left out.
+        series: the lines and dots; points that are not finite are left out.
         title, x_label, y_label: texts.
-        width, height: of the whole figure [px].
+        width, height: of the figure [px].
         flip_y: y grows downwards, as rows of an image do.
         equal: one unit is as long in x as in y.
         marks: x and text of vertical lines; browsers show the text under the pointer.
@@ -125,10 +125,11 @@ def arrows(
     title: str,
     factor: float,
 ) -> str:
-    """Vectors over an image plane, row 0 at the top, each with a dot where it begins.
+    """Draw vectors over an image plane, row 0 at the top, each with a dot where it begins.
 
     Args:
-        groups: name, places (m, 2) as (column, row) [px], and vectors (m, 2) alike; nan: none.
+        groups: name, places (m, 2) as (column, row) [px], and vectors (m, 2) alike; nan
+            is left out.
         size: of the plane, (rows, cols).
         title: of the figure.
         factor: by which vectors are enlarged.
@@ -150,7 +151,7 @@ def arrows(
 
 
 def ellipse_plot(covariance: npt.ArrayLike, names: tuple[str, str], scale: float) -> str:
-    """The ellipse of a 2 x 2 covariance at `scale` standard deviations, about zero."""
+    """Draw the ellipse of a 2 x 2 covariance at `scale` standard deviations, about zero."""
     values, vectors = np.linalg.eigh(np.asarray(covariance, dtype=np.float64))
     t = np.linspace(0, 2 * math.pi, 90)
     ring = vectors @ (
@@ -165,7 +166,9 @@ def ellipse_plot(covariance: npt.ArrayLike, names: tuple[str, str], scale: float
 def image_under(
     values: npt.ArrayLike, points: Sequence[Series], *, title: str, width: int = 730
 ) -> str:
-    """A grey image (rows, cols) with points over it; their x and y are its columns and rows."""
+    """Draw a grey image (rows, cols) with points over it; their x and y are columns and
+    rows.
+    """
     data = np.asarray(values, dtype=np.float64)
     figure = blank(width, 26 + (width - 90 * bool(points)) * data.shape[0] / data.shape[1])
     axes = axes_of(figure, title, "", "")
@@ -179,7 +182,7 @@ def image_under(
 
 
 def axes_of(figure: Figure, title: str, x_label: str, y_label: str) -> Axes:
-    """Axes that fill a figure, titled."""
+    """Add axes that fill a figure, with a title and labels."""
     axes = figure.add_subplot()
     axes.set_title(title, size=10, weight="bold", loc="left")
     axes.set_xlabel(x_label, size=9)
@@ -189,7 +192,7 @@ def axes_of(figure: Figure, title: str, x_label: str, y_label: str) -> Axes:
 
 
 def _id(*words: object) -> str:
-    """An id of a part of a figure."""
+    """Make the id of a part of a figure."""
     return re.sub(r"\W+", "-", " ".join(map(str, words)))
 
 

@@ -1,4 +1,4 @@
-"""Geometry from and to files and other programs' objects: what the methods of `ConeVec` call.
+"""Read and write geometries as files and other programs' objects, for methods of `ConeVec`.
 
 The formats are in `flexdt.twin.exchange`, their files in `flexdt.library.datasets.exchange`.
 """
@@ -43,13 +43,21 @@ from flexdt.twin.projection.volume import Grid, Volume
 from flexdt.twin.signatures import File
 
 OWN: Final = OWN_ENDINGS[0]
-"""Ending of flexdt's own document."""
+"""File ending of flexdt's own document."""
 CUBE: Final = 1e-6
-"""Relative difference of a voxel's edges taken for none."""
+"""Relative difference of a voxel's edges up to which it is a cube."""
 
 
 def from_astra(geometry: Any, shape: Shape2 | None) -> ConeVec:
-    """See `ConeVec.from_astra`."""
+    """Convert a geometry of ASTRA; see `ConeVec.from_astra`.
+
+    Args:
+        geometry: ASTRA's dictionary (`cone` or `cone_vec`), or rows (n, 12).
+        shape: detector (rows, cols), where ASTRA's is missing or to be checked.
+
+    Raises:
+        GeometryError: another type, or an incomplete geometry.
+    """
     if not isinstance(geometry, Mapping):
         return check_spread(ConeVec(as_numbers("cone_vec", geometry), shape))
     try:
@@ -78,7 +86,7 @@ def from_astra(geometry: Any, shape: Shape2 | None) -> ConeVec:
 
 
 def _circle_of_astra(geometry: Mapping[str, Any]) -> FloatArray:
-    """Rows of type `cone`: our circle, with v upwards."""
+    """Convert type `cone` to rows (n, 12) of our circle, with v upwards."""
     warn_of(radian_findings(geometry["ProjectionAngles"]), GeometryError, stacklevel=5)
     circle = ConeVec.circular(
         sod=float(geometry["DistanceOriginSource"]),
@@ -90,7 +98,7 @@ def _circle_of_astra(geometry: Mapping[str, Any]) -> FloatArray:
 
 
 def to_astra(cone_vec: ConeVec) -> dict[str, Any]:
-    """See `ConeVec.to_astra`."""
+    """Convert to ASTRA's dictionary; see `ConeVec.to_astra`."""
     rows, cols = cone_vec.of_shape()
     return {
         "type": "cone_vec",
@@ -101,7 +109,7 @@ def to_astra(cone_vec: ConeVec) -> dict[str, Any]:
 
 
 def from_tomosipo(geometry: Any) -> ConeVec:
-    """See `ConeVec.from_tomosipo`."""
+    """Convert a cone geometry of tomosipo; see `ConeVec.from_tomosipo`."""
     if not isinstance(geometry, Mapping):
         vectors = geometry.to_vec() if hasattr(geometry, "to_vec") else geometry
         names = ("det_shape", *TOMOSIPO_NAMES[1:])
@@ -119,13 +127,13 @@ def from_tomosipo(geometry: Any) -> ConeVec:
 
 
 def to_tomosipo(cone_vec: ConeVec) -> Any:
-    """See `ConeVec.to_tomosipo`."""
+    """Make a cone geometry of tomosipo; see `ConeVec.to_tomosipo`."""
     arrays = tomosipo_arrays(_scan(cone_vec))
     return _peer("tomosipo", "tomosipo", ".npz").cone_vec(**arrays)
 
 
 def to_cil(cone_vec: ConeVec) -> Any:
-    """See `ConeVec.to_cil`."""
+    """Make an acquisition geometry of CIL; see `ConeVec.to_cil`."""
     arrays = cil_arrays(_scan(cone_vec))
     framework = _peer("cil.framework", "CIL", ".cil")
     geometry = framework.AcquisitionGeometry.create_Cone3D_Flex(*(arrays[name] for name in POSES))
@@ -135,7 +143,15 @@ def to_cil(cone_vec: ConeVec) -> Any:
 
 
 def to_tigre(cone_vec: ConeVec, like: object) -> tuple[Any, FloatArray]:
-    """See `ConeVec.to_tigre`."""
+    """Make TIGRE's geometry and angles; see `ConeVec.to_tigre`.
+
+    Args:
+        cone_vec: the geometry.
+        like: grid or volume whose voxels it gets; None for no volume.
+
+    Returns:
+        TIGRE's geometry, and angles [rad].
+    """
     arrays = tigre_arrays(_scan(cone_vec))
     angles = np.asarray(arrays.pop(ANGLES), dtype=np.float64)
     geometry = _peer("tigre", "TIGRE", ".tigre").geometry(mode="cone")
@@ -152,7 +168,16 @@ def to_tigre(cone_vec: ConeVec, like: object) -> tuple[Any, FloatArray]:
 
 
 def to_leap(cone_vec: ConeVec, like: object, rows_up: bool) -> Any:
-    """See `ConeVec.to_leap`."""
+    """Make a model of LEAP; see `ConeVec.to_leap`.
+
+    Args:
+        cone_vec: the geometry.
+        like: grid or volume whose voxels it gets; None for LEAP's default volume.
+        rows_up: count rows upwards.
+
+    Raises:
+        ExchangeError: LEAP refuses the geometry or the volume.
+    """
     scan = _scan(cone_vec)
     arrays = leap_arrays(scan.rows_up() if rows_up else scan)
     model = _peer("leapctype", "LEAP", ".leap").tomographicModels()
@@ -174,10 +199,10 @@ def to_leap(cone_vec: ConeVec, like: object, rows_up: bool) -> Any:
 
 
 def _voxels(like: object) -> Volume:
-    """The volume, or one of zeros on the grid.
+    """Return the volume, or one of zeros on the grid.
 
     Raises:
-        GeometryError: neither.
+        GeometryError: `like` is neither.
     """
     if isinstance(like, Volume):
         return like
@@ -188,10 +213,10 @@ def _voxels(like: object) -> Volume:
 
 
 def _peer(module: str, name: str, ending: str) -> Any:
-    """Another program's module.
+    """Import another program's module.
 
     Raises:
-        ExchangeError: it cannot be imported; says which file it reads.
+        ExchangeError: it cannot be imported; names a file that it reads.
     """
     try:
         return import_module(module)
@@ -207,7 +232,7 @@ def load(
     shape: Shape2 | None,
     pixel: float | Sequence[float] | None,
 ) -> ConeVec:
-    """See `ConeVec.load`."""
+    """Read a geometry from a file; see `ConeVec.load`."""
     path = Path(file)
     pitch = None if pixel is None else _pair(pixel)
     if format is None and path.suffix.lower() == OWN:
@@ -217,7 +242,7 @@ def load(
 
 
 def _json(path: Path, given: Given) -> ScanGeometry:
-    """Our own document, or a CTSimU scenario: the document says which."""
+    """Read our own document, or a CTSimU scenario: the document tells which."""
     if "file" in read_json(text_of(path), str(path)):
         return import_geometry(path, "ctsimu", given)
     own = load_geometry(path)
@@ -228,7 +253,7 @@ def _json(path: Path, given: Given) -> ScanGeometry:
 
 
 def save(cone_vec: ConeVec, file: File, format: str | None) -> None:
-    """See `ConeVec.save`."""
+    """Write a geometry to a file; see `ConeVec.save`."""
     path = Path(file)
     if format is None and path.suffix.lower() == OWN:
         save_geometry(_scan(cone_vec), path)
@@ -238,7 +263,7 @@ def save(cone_vec: ConeVec, file: File, format: str | None) -> None:
 
 
 def _format(path: Path, among: Iterable[Format]) -> str:
-    """The name of the format whose files end so; `OWN` is flexdt's."""
+    """Return the name of the format with a file's ending; `OWN` is flexdt's."""
     by_ending = {ending: form.name for form in among for ending in form.endings if ending != OWN}
     found = by_ending.get(path.suffix.lower())
     if found is None:

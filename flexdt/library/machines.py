@@ -13,13 +13,13 @@ DEFAULT_MACHINE = "flexray"
 
 
 def machine(word: str | PathLike[str] | None = None) -> Machine:
-    """A machine by shipped name or by file; None is the FleX-ray.
+    """Return a machine by shipped name or by file; None is the FleX-ray.
 
     Args:
         word: `flexray` or another shipped name, or the path of a TOML file.
 
     Raises:
-        MachineFileError: the file does not hold.
+        MachineFileError: the file is invalid.
         UnknownNameError: neither a file nor a shipped name.
 
     Example:
@@ -36,10 +36,11 @@ def machine(word: str | PathLike[str] | None = None) -> Machine:
 
 
 def parsed(text: str, file: str) -> Machine:
-    """A machine from the text of its file, and from the meshes of its parts, which lie beside it.
+    """Parse a machine from the text of its file, and read the meshes of its parts next to it.
 
     Raises:
-        MachineFileError: the text or a mesh does not hold; file, part, what is allowed.
+        MachineFileError: the text or a mesh is invalid; names file, part and the allowed
+            values.
     """
     from flexdt.phantoms.files.mesh_files import read_part
     from flexdt.twin.collision.outer_hull import outer_hull
@@ -55,15 +56,15 @@ def parsed(text: str, file: str) -> Machine:
 def profile(
     word: Profile | str | PathLike[str] | None, of: Machine, file: str | None = None
 ) -> Profile:
-    """A calibration profile by shipped name or by file; None is the machine's default.
+    """Return a calibration profile by shipped name or by file; None is the machine's default.
 
     Args:
-        word: what was asked for, or the profile itself.
+        word: the requested name or file, or the profile itself.
         of: the machine.
-        file: what was asked for as the machine, for the error.
+        file: the requested machine, for the error.
 
     Raises:
-        MachineFileError: the file does not hold, or is for another machine.
+        MachineFileError: the file is invalid, or for another machine.
         UnknownNameError: neither a file nor a shipped name.
     """
     from flexdt.twin.errors import MachineFileError
@@ -92,5 +93,5 @@ def profile(
 
 
 def is_file(word: str) -> bool:
-    """Whether a word names a file instead of something that ships."""
+    """Check whether a word names a file instead of something that ships."""
     return word.endswith(".toml") or "/" in word or "\\" in word or Path(word).is_file()

@@ -17,16 +17,24 @@ from flexdt.twin.projection.volume import Volume
 from flexdt.twin.script import CheckReport, ScanPlan
 
 SAMPLES = 2000
-"""Moments at which motors are drawn."""
+"""Number of moments at which motors are drawn."""
 KINDS = {"dark": "k", "flat": "C1", "projection": "C0", "preview": "C7"}
 CORNERS = ((-0.5, -0.5), (-0.5, 0.5), (0.5, 0.5), (0.5, -0.5), (-0.5, -0.5))
 LAYERS = {"data": "attenuation", "sigma": "noise of attenuation", "bias_bound": "bound of its bias"}
 PANELS = 12
-"""Panels that are drawn at most, evenly chosen."""
+"""Largest number of panels drawn, evenly chosen."""
 
 
 def plot_geometry(cone_vec: ConeVec, axes: Any = None) -> Any:
-    """Sources, panels and central rays in the object's frame [mm], in three dimensions."""
+    """Plot sources, panels and central rays in the object's frame [mm], in three dimensions.
+
+    Args:
+        cone_vec: the geometry.
+        axes: three-dimensional axes of matplotlib; None makes a figure.
+
+    Returns:
+        The axes.
+    """
     if axes is None:
         axes = _pyplot().figure().add_subplot(projection="3d")
     axes.plot(*cone_vec.source.T, ".", label="source")
@@ -47,7 +55,7 @@ def plot_geometry(cone_vec: ConeVec, axes: Any = None) -> Any:
 
 
 def plot_projection(data: ImageSet, index: int, axes: Any = None) -> Any:
-    """Line integrals of one projection, as the source sees it."""
+    """Plot line integrals of one projection, as the source sees it; returns the axes."""
     axes = _pyplot().figure().add_subplot() if axes is None else axes
     shown = axes.imshow(data.line_integrals(index), cmap="gray")
     axes.figure.colorbar(shown, ax=axes, label="line integral")
@@ -56,7 +64,9 @@ def plot_projection(data: ImageSet, index: int, axes: Any = None) -> Any:
 
 
 def plot_volume(volume: Volume, axes: Any = None, what: str = "data") -> Any:
-    """The layer in the middle of a volume, or of its `sigma` or `bias_bound`, from above."""
+    """Plot the middle layer of a volume, or of its `sigma` or `bias_bound`; returns the
+    axes.
+    """
     values = getattr(volume, what, None) if what in LAYERS else None
     if values is None:
         allowed = [name for name in LAYERS if getattr(volume, name) is not None]
@@ -72,7 +82,15 @@ def plot_volume(volume: Volume, axes: Any = None, what: str = "data") -> Any:
 
 
 def plot_plan(plan: ScanPlan, report: CheckReport) -> Any:
-    """Motors, X-rays and exposures, and the smallest clearance over time [s]."""
+    """Plot motors, X-rays and exposures, and the smallest clearance over time [s].
+
+    Args:
+        plan: gives the motors' paths.
+        report: of its dry run, for clearance and collisions.
+
+    Returns:
+        matplotlib's figure.
+    """
     figure, (motors, beam, space) = _pyplot().subplots(
         3, 1, sharex=True, figsize=(9, 7), height_ratios=(5, 1, 2), layout="constrained"
     )
@@ -104,7 +122,7 @@ def plot_plan(plan: ScanPlan, report: CheckReport) -> Any:
 
 
 def _pyplot() -> Any:
-    """matplotlib.pyplot, or TwinError."""
+    """Import matplotlib.pyplot, or raise TwinError."""
     require_plots()
     from matplotlib import pyplot
 

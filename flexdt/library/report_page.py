@@ -38,7 +38,7 @@ class Markup(str):
 
 
 def page(title: str, body: Sequence[str]) -> str:
-    """Make a whole HTML page.
+    """Make a complete HTML page.
 
     Args:
         title: of the window.
@@ -57,7 +57,7 @@ def paragraph(*texts: str, kind: str = "") -> Markup:
 
     Args:
         texts: joined as they are.
-        kind: `good`, `bad`, `error`, `warning` or none.
+        kind: `good`, `bad`, `error`, `warning` or empty.
     """
     return _element("p", *texts, kind=kind)
 
@@ -123,7 +123,7 @@ def _row(tag: str, cells: Sequence[object], sides: Sequence[str], kind: str = ""
 
 
 def cell_text(value: object) -> str:
-    """Write a table's cell: numbers short, None as a dash."""
+    """Format the value of a table's cell: numbers short, `None` as a dash."""
     match value:
         case None:
             return "-"
@@ -138,7 +138,7 @@ def cell_text(value: object) -> str:
 
 
 def _element(tag: str, *content: str, kind: str = "") -> Markup:
-    """An element with its class; content that is no `Markup` is escaped."""
+    """Make an element with its class; content that is no `Markup` is escaped."""
     inner = "".join(part if isinstance(part, Markup) else html.escape(part) for part in content)
     mark = f" class='{kind}'" if kind else ""
     return Markup(f"<{tag}{mark}>{inner}</{tag}>")

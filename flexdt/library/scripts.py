@@ -1,5 +1,6 @@
-"""Machines and scan scripts as plans: the public functions `flexdt.machine` and `flexdt.plan`, and
-what plans do beyond the core."""
+"""Machines and scan scripts as plans: the public functions `flexdt.machine` and
+`flexdt.plan`, and functions of plans that need more than the core.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +45,7 @@ def plan(
             a file is a path.
         machine: a machine, its shipped name or its file; the FleX-ray if None.
         profile: zero offsets, their shipped name or file; the machine's default if None.
-        sample: what stands on the stage, for truncation: anything that `flexdt.simulate` takes.
+        sample: on the stage, for truncation: anything that `flexdt.simulate` takes.
 
     Returns:
         The plan: `.poses`, `.geometry`, `.duration_s`, `.problems`, `.check()`, `.plot()`, `==`,
@@ -67,7 +68,7 @@ def plan(
 
 
 def check(plan: ScanPlan, sample: object = None) -> CheckReport:
-    """See `ScanPlan.check`."""
+    """Check a plan, with its collisions and exposures; see `ScanPlan.check`."""
     phantom = None if sample is None else as_phantom(sample)
     collision = collisions(phantom) if plan.machine.components else None
     known = plan.start != StartState.of(plan.machine)
@@ -79,7 +80,7 @@ def with_exposures(report: CheckReport, phantom: Phantom | None) -> CheckReport:
 
     Args:
         report: of a dry run; one with errors is returned as it is.
-        phantom: on the stage; None adds nothing.
+        phantom: on the stage; None adds no warning.
     """
     if phantom is None or report.errors:
         return report
@@ -90,20 +91,20 @@ def with_exposures(report: CheckReport, phantom: Phantom | None) -> CheckReport:
 
 
 def size_of(phantom: Phantom | None) -> SampleSize | None:
-    """The size of a phantom on the stage; None leaves it to the script."""
+    """Return the size of a phantom on the stage; None leaves it to the script."""
     return None if phantom is None else SampleSize.around(phantom.size_mm, phantom.name)
 
 
 def collisions(phantom: Phantom | None) -> CollisionCheck:
-    """The collision check with the phantom's mesh, or with the script's sample size."""
+    """Make the collision check with the phantom's mesh, or with the script's sample size."""
     return collision_check(None if phantom is None else convex_pieces(phantom.mesh(around=True)))
 
 
 def read(path: File) -> bytes:
-    """The bytes of a script's file."""
+    """Read the bytes of a script's file."""
     return Path(path).read_bytes()
 
 
 def _names_a_file(text: str) -> bool:
-    """Whether one line is a path: there is such a file, or it looks like the name of one."""
+    """Check whether one line is a path: the file exists, or the line looks like its name."""
     return Path(text).is_file() or (" " not in text and text.endswith(".txt"))

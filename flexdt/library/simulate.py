@@ -67,7 +67,7 @@ BATCH_BYTES: Final = 64 << 20
 """Path lengths in memory at a time."""
 MOST_POINTS: Final = 1024
 FILLED: Final = 0.8
-"""Part of the panel's range that the open beam fills where the exposure is chosen."""
+"""Part of the panel's range that the open beam fills with the default exposure."""
 DOUBTED_PX: Final = 0.25
 """Difference of the spot's blur over a sample from which it is worth a warning [pixels]."""
 SAME_PITCH: Final = 1e-6
@@ -76,7 +76,7 @@ SAME_PITCH: Final = 1e-6
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Truth:
-    """What lies behind a simulated data set.
+    """Sample and settings of a simulated data set.
 
     Attributes:
         sample: as it was simulated.
@@ -85,8 +85,8 @@ class Truth:
         exposure: tube and time of each image.
         camera: mode and region of interest.
         seed: of the noise; None without any.
-        parts: the materials and where they are.
-        scatter: of each view, in units of the open beam; None where none was simulated.
+        parts: the materials and their places.
+        scatter: of each view, in units of the open beam; None if it was not simulated.
         rays: along each side of a pixel.
         spot_points: of the focal spot; 1 for one blur of the whole image.
     """
@@ -110,18 +110,19 @@ class Truth:
         )
 
     def of_views(self, chosen: npt.NDArray[np.intp]) -> Truth:
-        """That of some of the views."""
+        """Return the truth of some of the views."""
         scatter = None if self.scatter is None else self.scatter.of_views(chosen)
         return replace(self, geometry=self.geometry[chosen], scatter=scatter)
 
     @property
     def assumed(self) -> tuple[str, ...]:
-        """What is not known about the materials."""
+        """Assumptions about the materials."""
         return tuple(dict.fromkeys(p.assumed for p in self.parts if p.assumed))
 
     def paths_mm(self, views: slice = slice(None)) -> Float32Array:
-        """Path of the ray to each pixel's centre through each material, float32 (materials, n,
-        rows, cols) [mm]."""
+        """Compute the path of the ray to each pixel's centre through each material,
+        float32 (materials, n, rows, cols) [mm].
+        """
         return self._paths(self.geometry[views])
 
     def _paths(self, cone: ConeVec) -> Float32Array:
@@ -131,7 +132,7 @@ class Truth:
         return out
 
     def radiographs(self) -> Iterator[Radiograph]:
-        """What the X-rays of each view do to the panel, without noise."""
+        """Simulate the noise-free radiograph of each view."""
         rows, cols = self.camera.shape
         chain, moments = self.chain, self.rays**2 * self.spot_points
         spot_mm = chain.tube.focal_spot_mm(self.exposure.power_W)
@@ -152,7 +153,9 @@ class Truth:
             )
 
     def line_integrals(self) -> Float32Array:
-        """-log of the noise-free signal over the open beam's, float32 (n, rows, cols)."""
+        """Compute -log of the noise-free signal over the open beam's, float32 (n, rows,
+        cols).
+        """
         return np.stack([image.integrals for image in self.radiographs()])
 
 
@@ -166,7 +169,8 @@ def project(
     voxel_mm: float | Vector | None = None,
     progress: Progress = None,
 ) -> Float32Array:
-    """Line integrals of attenuation, without tube, noise and detector; see `flexdt.simulate`.
+    """Project line integrals of attenuation, without tube, noise and detector; see
+    `flexdt.simulate`.
 
     Solids and meshes are exact path lengths times their attenuation at its effective energy, voxels
     exact lengths through each voxel (Siddon). Bodies of one mesh that overlap count once.
@@ -175,10 +179,11 @@ def project(
         sample: a Volume, a phantom or its name, a file, a mesh, an array with `voxel_mm`, or a list
             of them, which add up.
         geometry: of the views, in the sample's frame.
-        shape: detector (rows, cols), where the geometry does not say.
+        shape: detector (rows, cols), where the geometry has none.
         material: of a mesh or an array; {1: "pmma", 2: "steel"} for an array of labels.
         voxel_mm: edge of an array's voxels [mm].
-        progress: a bar after two seconds; False for none, or what takes the fraction done.
+        progress: a bar after two seconds; False for no bar, or a function of the fraction
+            done.
 
     Returns:
         float32 (n, rows, cols), dimensionless.
@@ -187,7 +192,7 @@ def project(
         UserWarning: a geometry that fits no scan of the sample: the source inside it, ...
 
     Raises:
-        TwinError: a sample or a geometry that does not hold; says what is allowed.
+        TwinError: an invalid sample or geometry; names the allowed values.
 
     Example:
         >>> import numpy as np
@@ -229,22 +234,22 @@ def simulate(
     Args:
         sample: a phantom or its name, a file (phantom, scene, mesh), a Volume, an array with
             `voxel_mm`, a mesh, or a list of them; see `flexdt.phantoms.samples.as_phantom`.
-        geometry: of the views, in the sample's frame; it gives the pixels' pitch.
-            Without one the sample is the path of a CTSimU scenario, which says everything but
+        geometry: of the views, in the sample's frame; it gives the pixels' pitch. Without
+            one the sample is the path of a CTSimU scenario, which states everything but
             `noise`; `flexdt-extensions` does it.
         tube: default: 90 kV, 50 W; filters and focal spot that it leaves open are the machine's.
         detector: default: the machine's, else the twin's panel with the geometry's pixels.
         noise: seed, >= 0; None for the expectation. Image i has a random generator of its own,
             counting the dark image (0), the flat image (1) and the projections.
-        exposure_ms: of one read-out; None: the detector's or the machine's, or, where neither
-            states one, so long that the brightest pixel of the open beam reaches 80 % of the
-            largest count. `truth` says it.
+        exposure_ms: of one read-out; None: the detector's or the machine's, or, where
+            neither states one, so long that the brightest pixel of the open beam reaches
+            80 % of the largest count. `truth` holds it.
         scatter: "mc" adds the radiation that the sample scatters, by Monte Carlo with the seed of
             `noise`; 'first' has been removed, use 'mc'. `ScatterSettings` state more. It is in the
             data set's `truth.scatter`.
         machine: a machine, its name or file, whose tube and detector are taken where `tube` and
             `detector` leave them open.
-        shape: detector (rows, cols), where the geometry does not say.
+        shape: detector (rows, cols), where the geometry has none.
         material: of a mesh or an array; {1: "pmma", 2: "steel"} for an array of labels.
         voxel_mm: edge of an array's voxels [mm].
         rays: along each side of a pixel, 1 to 16; their signals are averaged, as a pixel does.
@@ -254,17 +259,19 @@ def simulate(
             and each depth of the sample is blurred as it is. With 1 all are blurred as the rotation
             axis is, and the data set warns where that matters. Ghosts of edges stay where the blur
             [pixels] is more than about a quarter of the points.
-        progress: a bar after two seconds; False for none, or what takes the fraction done.
+        progress: a bar after two seconds; False for no bar, or a function of the fraction
+            done.
 
     Returns:
-        The data set in memory; its `truth` is what lies behind it.
+        The data set in memory; its `truth` has sample and settings.
 
     Raises:
-        TwinError: a sample, geometry, tube or detector that does not hold; says what is allowed.
+        TwinError: an invalid sample, geometry, tube or detector; names the allowed
+            values.
 
     Warns:
-        UserWarning: what is doubtful about the images, such as saturated pixels; it is in the data
-            set's `warnings` too.
+        UserWarning: doubts about the images, such as saturated pixels, which are in the
+            data set's `warnings` too.
 
     Example:
         >>> geometry = ConeVec.from_vectors([0, -400, 0], [0, 400, 0], [0.5, 0, 0], [0, 0, -0.5])
@@ -352,7 +359,7 @@ def simulate(
 
 
 def _attenuation(body: Volume | Phantom) -> npt.NDArray[Any] | None:
-    """The voxels' attenuation, where a sample has some."""
+    """Return the attenuation of a sample's voxels; None without voxels."""
     if isinstance(body, Volume):
         return body.data
     voxels = body.voxels
@@ -360,7 +367,7 @@ def _attenuation(body: Volume | Phantom) -> npt.NDArray[Any] | None:
 
 
 def _chosen_ms(panel: Detector, camera: CameraSettings, beam_e_per_ms: float) -> float:
-    """Exposure that fills `FILLED` of the panel's range with the open beam [ms].
+    """Compute the exposure that fills `FILLED` of the panel's range with the open beam [ms].
 
     Raises:
         LimitError: the panel's offset leaves no range to fill.
@@ -374,7 +381,7 @@ def _chosen_ms(panel: Detector, camera: CameraSettings, beam_e_per_ms: float) ->
 
 
 def _pitch(cone: ConeVec) -> tuple[float, float]:
-    """The pixels' edges along u and v, alike in all views."""
+    """Return the pixels' edges along u and v [mm], which must be alike in all views."""
     lengths = np.linalg.norm([cone.u, cone.v], axis=2)
     if not lengths.size:
         raise GeometryError("a geometry without views cannot be simulated", {"asked": 0})
@@ -391,6 +398,17 @@ def _panel(
     detector: Detector | None, machine: Machine | None, shape: tuple[int, int], pitch: float,
     row_pitch: float,
 ) -> tuple[Detector, CameraSettings]:  # fmt: skip
+    """Make detector and camera settings for a geometry's pixels.
+
+    Args:
+        detector: as given, or None.
+        machine: whose detector is used otherwise.
+        shape: (rows, cols).
+        pitch, row_pitch: pixel edges along columns and rows [mm].
+
+    Raises:
+        LimitError: the machine's detector has no such pixels.
+    """
     if detector is not None:
         grid = PixelGrid(shape[1], shape[0], pitch, None if row_pitch == pitch else row_pitch)
         return detector.of_pixels(grid), detector.camera(shape)
@@ -422,7 +440,7 @@ def _panel(
 
 
 def _flat_doubt(shape: tuple[int, int], cone: ConeVec) -> Iterator[str]:
-    """The flat image holds for views of one distance."""
+    """Warn if the flat image, valid for views of one distance, differs between views."""
     first = flux_of(cone.rows[0], shape)
     worst = max(
         (float(np.abs(flux_of(row, shape) / first - 1.0).max()) for row in _different(cone)),
@@ -436,7 +454,7 @@ def _flat_doubt(shape: tuple[int, int], cone: ConeVec) -> Iterator[str]:
 
 
 def _spot_doubt(truth: Truth) -> Iterator[str]:
-    """One blur holds for a sample of little depth."""
+    """Warn if one blur does not hold for the sample's depth."""
     spot_mm = truth.chain.tube.focal_spot_mm(truth.exposure.power_W)
     half = 0.5 * float(np.hypot(*truth.sample.size_mm[:2]))
     view = truth.geometry.rows[0]

@@ -11,7 +11,7 @@ from flexdt.twin.projection.volume import Volume
 
 
 def images_to_xarray(data: ImageSet) -> Any:
-    """See `DataSet.to_xarray`."""
+    """Return a data set's line integrals as a DataArray; see `DataSet.to_xarray`."""
     xarray = package("xarray", "to_xarray")
     rows = data.geometry.rows
     return xarray.DataArray(
@@ -28,7 +28,7 @@ def images_to_xarray(data: ImageSet) -> Any:
 
 
 def volume_to_xarray(volume: Volume) -> Any:
-    """See `Volume.to_xarray`."""
+    """Return a volume as a DataArray; see `Volume.to_xarray`."""
     xarray = package("xarray", "to_xarray")
     places = zip("xyz", volume.centers(), strict=True)
     coords = {axis: (axis, values, {"units": "mm"}) for axis, values in places}

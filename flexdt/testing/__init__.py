@@ -1,4 +1,4 @@
-"""What tests of your own programme need of a scanner: a twin in process, and drawn input.
+"""Test kit for programs that use a scanner: a twin in process, and drawn input.
 
     from flexdt.testing import twin
 

@@ -17,7 +17,8 @@ __all__ = ["flexdt_twin"]
 
 @pytest.fixture
 def flexdt_twin(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[testing.InProcessTwin]:
-    """A twin in process (`flexdt.testing.twin`), its data in `tmp_path`, a new one for each test.
+    """Provide a twin in process (`flexdt.testing.twin`), its data in `tmp_path`, one for
+    each test.
 
     Arguments of `twin` come by indirect parameters:
     `@pytest.mark.parametrize("flexdt_twin", [{"machine": "micro_ct"}], indirect=True)`.

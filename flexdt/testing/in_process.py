@@ -1,13 +1,14 @@
-"""A whole twin in the process and thread of its test: no socket, no server process, no sleep.
+"""A complete twin in the process and thread of its test: no socket, no server process, no
+sleep.
 
 The server, its connections and its clients are the real ones. They share one event loop, whose time
 is virtual and passes only while a call waits, so the same calls give the same answers, at once.
 
-The event loop never sleeps, and the same seed gives the same run. When nothing is ready the clock
-jumps to the next timer. Work for threads runs in the loop itself, at once, or a moment drawn from a
-seed later, so that what runs beside each other comes in many orders. A wait that nothing can end is
-an error (`Deadlock`) instead of a test that hangs; a loop that runs for ever in a thread (Bluesky's
-engine does that) waits for the next request instead.
+The event loop never sleeps, and the same seed gives the same run. When nothing is ready
+the clock jumps to the next timer. Work for threads runs in the loop itself, at once, or a
+moment drawn from a seed later, so that concurrent work comes in many orders. A wait that
+nothing can end is an error (`Deadlock`) instead of a test that hangs; a loop that runs
+for ever in a thread (Bluesky's engine does that) waits for the next request instead.
 """
 
 from __future__ import annotations
@@ -49,11 +50,11 @@ class Deadlock(Exception):
 
 
 class SimulatedLoop(asyncio.SelectorEventLoop):
-    """A loop of its own time.
+    """Event loop on virtual time.
 
     Args:
-        rng: draws when work for threads runs; None: at once.
-        start: its clock at first [s].
+        rng: draws the delay of work for threads; None: at once.
+        start: of its clock [s].
     """
 
     def __init__(self, rng: random.Random | None = None, start: float = 0.0) -> None:
@@ -64,7 +65,7 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
         super().__init__(_Jumps(self))
 
     def time(self) -> float:
-        """Virtual seconds."""
+        """Return the virtual time [s]."""
         return self._now
 
     def jump(self, seconds: float) -> None:
@@ -72,10 +73,10 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
         self._now += seconds
 
     def run_until_complete(self, future: Generator[Any, None, T] | Awaitable[T]) -> T:
-        """As any loop does.
+        """Run the loop until a future is done, and return its result.
 
         Raises:
-            Deadlock: nothing is left that could complete it.
+            Deadlock: no event is left that could complete it.
         """
         self.alone = True
         try:
@@ -101,7 +102,7 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
 
 
 def _work(done: asyncio.Future[Any], func: Callable[..., Any], args: tuple[Any, ...]) -> None:
-    """As a thread: it ends its work even if nobody waits for it any more."""
+    """Run a function as a thread would: to its end, even if its future was cancelled."""
     try:
         result = func(*args)
     except Exception as error:
@@ -150,7 +151,7 @@ class DirectProjector:
         del self.known[name]
 
     async def project(self, name: str, cone_vec: ConeVec, shape: tuple[int, int]) -> Float32Array:
-        """Line integrals, float32 (n, rows, cols)."""
+        """Compute line integrals, float32 (n, rows, cols)."""
         return project_body(self.known[name], cone_vec, shape)
 
 
@@ -178,10 +179,10 @@ class InProcessTransport(asyncio.Transport):
         self._server: _Receiver | None = None
 
     async def open(self) -> None:
-        """Connect anew.
+        """Connect, after closing an earlier connection.
 
         Raises:
-            RuntimeError: in another event loop.
+            RuntimeError: called in another event loop.
         """
         if asyncio.get_running_loop() is not self._loop:
             say = "a twin in process answers on its own event loop: RunEngine({}, loop=twin.loop)"
@@ -199,7 +200,7 @@ class InProcessTransport(asyncio.Transport):
         self._server.data_received(self._wire.send(message))
 
     async def receive(self) -> list[Message]:
-        """Messages, or an empty list at the end."""
+        """Return received messages, or an empty list at the end."""
         messages: list[Message] = []
         while not messages and (data := await self._inbox.get()):
             messages = self._wire.receive_data(data)
@@ -218,11 +219,11 @@ class InProcessTransport(asyncio.Transport):
             self._loop.call_soon(server.connection_lost, None)
 
     def is_closing(self) -> bool:
-        """Whether it has ended."""
+        """Return whether the connection has ended."""
         return self._server is None
 
     def get_write_buffer_size(self, *_: Any, **__: Any) -> int:
-        """Nothing waits here: what is written lies in the client's memory."""
+        """Return 0: written bytes are in the client's memory at once."""
         return 0
 
     abort = close
@@ -245,7 +246,7 @@ class InProcessTwin:
 
     Attributes:
         client: a connected `TwinClient`.
-        loop: of virtual time, for what is asynchronous: `RunEngine({}, loop=twin.loop)`.
+        loop: of virtual time, for asynchronous programs: `RunEngine({}, loop=twin.loop)`.
         server: the twin server's parts, to look inside.
         data: the folder in which data sets appear.
     """
@@ -261,18 +262,19 @@ class InProcessTwin:
         self.run(asyncio.sleep(seconds))
 
     def connect(self, name: str = "flexdt.testing") -> TwinClient:
-        """Another client: a second controller, or somebody who watches."""
+        """Connect another client: a second controller, or an observer."""
         return _Client(self, name)
 
     def transport(self) -> Transport:
-        """A connection of its own, for `AsyncTwinClient` and for Bluesky's `TwinLab`."""
+        """Make a connection of its own, for `AsyncTwinClient` and for Bluesky's `TwinLab`."""
         return InProcessTransport(self.loop, self._shell.connection)
 
     def run(self, work: Coroutine[Any, Any, T]) -> T:
-        """The result of a coroutine on the twin's loop; time passes until it is there.
+        """Run a coroutine on the twin's loop, and return its result; virtual time passes
+        meanwhile.
 
         Raises:
-            Deadlock: nothing is left that could end the wait.
+            Deadlock: no event is left that could end the wait.
             RuntimeError: called in an event loop, where it would wait for itself.
         """
         here = asyncio._get_running_loop()
@@ -299,7 +301,7 @@ def twin(
     seed: int | None = 0,
     data: str | PathLike[str] | None = None,
 ) -> Iterator[InProcessTwin]:
-    """A twin in this process, for tests; it ends with the `with` block.
+    """Start a twin in this process, for tests; it ends with the `with` block.
 
     Motion takes the machine's true time, by its speeds and accelerations, on a virtual clock that
     passes while a call waits (`move(..., wait=True)`, `wait_job`) or in `advance`, and at no other
@@ -310,14 +312,14 @@ def twin(
     Args:
         machine: the scanner, its shipped name or file; None for the FleX-ray. Its zero offsets are
             those of its default profile.
-        sample: on the stage at start, a phantom's name; none unless given.
+        sample: on the stage at start, a phantom's name; empty for no sample.
         physics: how images are made: ideal, mono or poly.
         speed_up: the twin's seconds for each of the loop; "max" ends each motion at once.
         seed: of a scan's noise; None for images without noise.
-        data: folder for all that the twin writes; None for a temporary one.
+        data: folder for the twin's files; None for a temporary one.
 
     Raises:
-        MachineFileError, UnknownNameError: there is no such machine or sample.
+        MachineFileError, UnknownNameError: unknown machine or sample.
 
     Example:
         >>> with twin() as scanner:

@@ -1,4 +1,4 @@
-"""Hypothesis strategies: machines and geometries that nobody thought of.
+"""Hypothesis strategies that draw machines and geometries.
 
     from hypothesis import given
     from flexdt.testing.strategies import geometries
@@ -30,8 +30,9 @@ MACHINES = {name: builtin_machine(name) for name in builtin_machines()}
 
 @st.composite
 def machines(draw: st.DrawFn) -> Machine:
-    """Valid machines: each of the shipped ones, whose motors have names and directions of their
-    own, with other travel, speeds and accelerations; name and zero offsets are the shipped one's.
+    """Draw valid machines: each of the shipped ones, whose motors have names and
+    directions of their own, with other travel, speeds and accelerations; name and zero
+    offsets are the shipped one's.
 
     Example:
         >>> @given(machines())
@@ -52,8 +53,9 @@ def machines(draw: st.DrawFn) -> Machine:
 
 @st.composite
 def geometries(draw: st.DrawFn, *, max_views: int = 8, max_pixels: int = 64) -> ConeVec:
-    """Cone-beam geometries with a detector: circles and helices at any angles, even or not, with
-    the panel moved aside and tilted by up to 10 deg about each axis, and pixels that may be oblong.
+    """Draw cone-beam geometries with a detector: circles and helices at any angles, even
+    or not, with the panel moved aside and tilted by up to 10 deg about each axis, and
+    pixels that may be oblong.
 
     Args:
         draw: of Hypothesis.

@@ -1,1 +1,1 @@
-"""What values show in a notebook."""
+"""Displays of values in a notebook."""

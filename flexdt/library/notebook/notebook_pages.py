@@ -34,7 +34,7 @@ SIDE_PX: Final = 220
 DRAWING_PX: Final = 420
 """Side of the drawing of a geometry."""
 MARGIN: Final = 0.06
-"""Of the drawing's side, left free around a geometry."""
+"""Free margin around a geometry, as a share of the drawing's side."""
 ELEVATION_DEG: Final = 30.0
 """Of the eye above the plane of the turn, in the drawing of a geometry."""
 PANEL_CORNERS: Final = ((-0.5, -0.5), (-0.5, 0.5), (0.5, 0.5), (0.5, -0.5))
@@ -47,12 +47,12 @@ SHOW_CHOSEN: Final = (
     "e.hidden = i != this.value; this.nextElementSibling.textContent = "
     "this.parentNode.querySelectorAll('[data-of]')[this.value].dataset.of"
 )
-"""What a slider does: shows the chosen one of the pictures beside it, and its name."""
+"""Handler of a slider: shows the chosen picture of its row, and its name."""
 
 
 @dataclass(frozen=True)
 class NotebookPage:
-    """What `show` gives: a notebook shows it, and `save` writes it.
+    """A page that a notebook shows, and `save` writes.
 
     Attributes:
         html: the page's content, without `html` and `body`.
@@ -86,7 +86,7 @@ def volume_page(volume: Volume, window: Sequence[float] | None = None) -> Notebo
         window: attenuation of black and of white [1/mm]; None: percentiles of the volume.
 
     Raises:
-        TwinError: a window that is none.
+        TwinError: the window is not two growing numbers.
     """
     low, high = window_of(volume.data, window)
     data, centers = volume.data, volume.centers()
@@ -177,7 +177,7 @@ class _Drawing:
     Attributes:
         middle: of what is drawn (x, y, z) [mm].
         millimetres: along the square's side.
-        radius_mm: of the circle that stands for the sample.
+        radius_mm: of the circle drawn for the sample.
     """
 
     middle: npt.NDArray[np.float64]
@@ -186,7 +186,11 @@ class _Drawing:
 
     @classmethod
     def of(cls, cone_vec: ConeVec) -> _Drawing:
-        """Choose the scale at which everything is seen."""
+        """Choose the scale at which sources, panels and sample fit into the drawing.
+
+        Args:
+            cone_vec: all views.
+        """
         ends = np.concatenate([cone_vec.source, cone_vec.detector, np.zeros((1, 3))])
         if cone_vec.detector_shape is not None:
             panels = [panel_corners(cone_vec, i) for i in range(len(cone_vec))]
@@ -211,7 +215,7 @@ class _Drawing:
         return DRAWING_PX / 2 + scale * float(x), DRAWING_PX / 2 - scale * float(up)
 
     def still(self, cone_vec: ConeVec) -> str:
-        """Draw what all views share: places of the source, and the sample."""
+        """Draw the parts that all views share: places of the source, and the sample."""
         dots = "".join(
             f'<circle cx="{x:.1f}" cy="{y:.1f}" r="1" fill="#d33" opacity=".4"/>'
             for x, y in (self.point(cone_vec.source[i]) for i in _some(len(cone_vec)))
@@ -223,7 +227,15 @@ class _Drawing:
         )
 
     def view(self, cone_vec: ConeVec, index: int) -> str:
-        """Draw one view: source, central ray and panel."""
+        """Draw one view: source, central ray and panel.
+
+        Args:
+            cone_vec: all views.
+            index: of the view.
+
+        Returns:
+            SVG elements.
+        """
         source, centre = (
             self.point(place[index]) for place in (cone_vec.source, cone_vec.detector)
         )
@@ -272,7 +284,7 @@ def _grey(image: npt.NDArray[Any], low: float, high: float) -> npt.NDArray[np.ui
 
 
 def _slider(count: int, what: str, handler: str, start: int) -> str:
-    """Write a slider that stands at `start`; one picture needs none."""
+    """Write a slider at position `start`; hidden for a single picture."""
     hidden = " hidden" if count < 2 else ""
     return (
         f'<input type="range" min="0" max="{max(count - 1, 0)}" value="{start}" '
@@ -290,7 +302,7 @@ def _sliding(
 
     Args:
         pictures: name and pixels of each.
-        what: they are.
+        what: name of the pictures.
         tall: height of a pixel over its width.
         start: index of the one that is shown at first.
     """
@@ -313,5 +325,5 @@ def _sliding(
 
 
 def _row(parts: Sequence[str]) -> str:
-    """Write parts beside each other."""
+    """Write parts side by side."""
     return f"<div>{''.join(parts)}</div>"

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def show_volume(volume: Volume, window: Sequence[float] | None = None) -> Any:
-    """See `Volume.show`."""
+    """Return widgets, or a page without ipywidgets, of a volume; see `Volume.show`."""
     if in_notebook() and lacking("ipywidgets", "ipywidgets", "notebook") is None:
         widgets = package("ipywidgets", "a volume with live sliders", "notebook")
         return volume_widgets(widgets, volume, window)
@@ -24,5 +24,5 @@ def show_volume(volume: Volume, window: Sequence[float] | None = None) -> Any:
 
 
 def show_geometry(cone_vec: ConeVec) -> NotebookPage:
-    """See `ConeVec.show`."""
+    """Return the page of a geometry; see `ConeVec.show`."""
     return geometry_page(cone_vec)

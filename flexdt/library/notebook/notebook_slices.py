@@ -14,7 +14,7 @@ from flexdt.twin.errors import TwinError
 MOST_VALUES: Final = 1_000_000
 """Of which percentiles are taken; of more, about so many are taken, evenly spread."""
 AXES: Final = (("z", 0, "xy"), ("y", 1, "xz"), ("x", 2, "yz"))
-"""Name of an axis, its place in the data, and the axes of its layers (to the right, up)."""
+"""Name of an axis, its index in the data, and the axes of its layers (to the right, up)."""
 
 
 def layer_of(data: npt.NDArray[Any], axis: int, index: int) -> npt.NDArray[Any]:

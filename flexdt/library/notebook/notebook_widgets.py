@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 WIDTH_PX: Final = 240
 """Width of a picture."""
 REACH: Final = 0.5
-"""Of the window's width, by which the window's slider goes beyond it on both sides."""
+"""Reach of the window's slider beyond the window, on each side, as a share of its width."""
 
 
 def volume_widgets(widgets: Any, volume: Volume, window: Sequence[float] | None = None) -> Any:

@@ -1,4 +1,4 @@
-"""Data sets in folders: which frames there are, their geometry, completeness; and saved ones.
+"""Read and save data sets in folders: frames, geometry, completeness.
 
 Works on folders that this package wrote and on a scanner's own (TIFFs and the two settings texts
 alone). Errors are typed and name the file; what leaves the rest usable is a warning in `warnings`.
@@ -59,9 +59,9 @@ from flexdt.twin.plausibility.image_order import duplicate
 from flexdt.twin.signatures import public
 
 AGREE_MM: Final = 1e-6
-"""How far the cone_vec of a file may lie from what its motor positions give [mm]."""
+"""Largest difference of a file's cone_vec from the one of its motor positions [mm]."""
 MAX_SETTINGS_BYTES: Final = 16 << 20
-"""Of a settings text; a larger file is none."""
+"""Largest settings text [bytes]; a larger file is none."""
 
 
 @public
@@ -80,17 +80,17 @@ def load_dataset(
         folder: a folder of TIFFs with flexdt.json, or with a scanner's settings texts; Nikon's
             .xtekct file beside its TIFFs; Zeiss's .txrm; an NXtomo file; or a folder with one of
             these.
-        machine: the scanner, for texts that do not say one that ships with the package.
+        machine: the scanner, for texts that do not name one that ships with the package.
         profile: zero offsets to use; default: those of the file, or the profile that reproduces
             the printed figures.
         ignore_document: use the texts alone even if flexdt.json is there.
-        geometry: one view for each projection, in place of a file's, or where an NXtomo or .txrm
-            file does not say it.
-        distances: source to axis and source to panel [mm], of an NXtomo file that says angles and
-            pixels alone.
+        geometry: one view for each projection, in place of a file's, or where an NXtomo
+            or .txrm file has none.
+        distances: source to axis and source to panel [mm], of an NXtomo file that has
+            angles and pixels only.
 
     Raises:
-        DatasetError: what is wrong, with its path.
+        DatasetError: the data set is invalid; names the path.
 
     Example:
         >>> data = load_dataset("my-scans/lego")  # doctest: +SKIP
@@ -123,18 +123,18 @@ def read_tiffs(
     dark: str = "di*",
     flat: str = "io*",
 ) -> DataSet:
-    """Anybody's frames: TIFF images in a folder, and a geometry for them.
+    """Read TIFF images in a folder, with a geometry for them.
 
-    Images are counts (uint16), or floats: counts too if there is a flat image, else line integrals.
-    Floats are kept in memory as counts of an open beam of 60000, or down to 20000 where pixels are
-    brighter than it; a warning says how many are beyond what that holds.
+    Images are counts (uint16), or floats: counts too if there is a flat image, else line
+    integrals. Floats are kept in memory as counts of an open beam of 60000, or down to
+    20000 where pixels are brighter than it; a warning gives the number beyond that range.
 
     Args:
         folder: where the images are.
         geometry: one view for each projection, in the order of their names, where 10 comes after
             9; or a file that `ConeVec.load` reads.
-        frames, dark, flat: patterns of the names of projections, dark and flat images. What is
-            dark or flat is no projection.
+        frames, dark, flat: patterns of the names of projections, dark and flat images.
+            Dark and flat images are no projections.
 
     Raises:
         DatasetError: no images, or another number or shape of them than the geometry has.
@@ -185,7 +185,16 @@ def _of_floats(
     darks: Sequence[str],
     flats: Sequence[str],
 ) -> DataSet:
-    """The data set of float images, in memory."""
+    """Read float images into a data set in memory.
+
+    Args:
+        folder: of the images.
+        geometry: one view for each projection.
+        names, darks, flats: of the images; without flat images they are line integrals.
+
+    Raises:
+        DatasetFormatError: a pixel is not finite.
+    """
     shape = read_values(folder / names[0]).shape
     values = [read_values(folder / n, shape) for n in names]
     images = np.stack(values).astype(np.float32)
@@ -202,6 +211,15 @@ def _of_floats(
 
 
 def _from_document(content: Folder, machine: Machine | None, profile: Profile | None) -> DataSet:
+    """Read a data set by its flexdt.json.
+
+    Args:
+        content: the folder.
+        machine, profile: in place of the document's, or None.
+
+    Raises:
+        DatasetError: the document is invalid, or frames do not fit it.
+    """
     path = content.path / DOCUMENT
     doc = parse_document(read_text(path), str(path))
     own = machine is None and profile is None
@@ -245,7 +263,7 @@ def _from_document(content: Folder, machine: Machine | None, profile: Profile | 
 
 
 def _foreign_file(content: Folder) -> Path | None:
-    """The file that says a whole scan of another program, in a folder without one of ours.
+    """Return the only file with a scan of another program, in a folder without one of ours.
 
     Returns:
         None where the folder has images of ours, or no such file, or several.
@@ -270,7 +288,7 @@ def _other_scan(content: Folder) -> str:
 
 
 def _predicted_doubts(doc: DatasetDocument, seen: Sequence[str]) -> list[str]:
-    """Say what was predicted against a scan's exposure, where its images have not said it."""
+    """List the doubts predicted about a scan's exposure that its images do not show already."""
     saturated = any(SATURATED in one for one in seen)
     return [
         f"predicted at submission: {doubt}"
@@ -281,7 +299,9 @@ def _predicted_doubts(doc: DatasetDocument, seen: Sequence[str]) -> list[str]:
 
 
 def _from_geometry(content: Folder) -> DataSet:
-    """What `DataSet.save` wrote for a scan without a machine: images and their geometry."""
+    """Read the data set that `DataSet.save` wrote for a scan without a machine: images
+    and geometry.
+    """
     _require_one_each(content)
     path = content.path / GEOMETRY
     geometry = read_geometry_text(read_text(path), str(path))
@@ -293,6 +313,15 @@ def _from_geometry(content: Folder) -> DataSet:
 
 
 def _from_texts(content: Folder, machine: Machine | None, profile: Profile | None) -> DataSet:
+    """Read a data set by the scanner's settings texts.
+
+    Args:
+        content: the folder.
+        machine, profile: in place of those that the texts name, or None.
+
+    Raises:
+        DatasetError: no projections, no usable text, or a scan of several sections.
+    """
     if not content.projections:
         raise DatasetMissingError(
             f"{content.path}: no projections (scan_000000.tif ...){_other_scan(content)}",
@@ -342,7 +371,18 @@ def _from_texts(content: Folder, machine: Machine | None, profile: Profile | Non
 
 
 def read_settings(content: Folder, warnings: list[str]) -> ScanSettings | None:
-    """The settings of the scanner's text, or of its second text where the first is of no use."""
+    """Read the settings of the scanner's text, or of its second text if the first is unusable.
+
+    Args:
+        content: the folder.
+        warnings: get the errors of the text that is not used.
+
+    Returns:
+        None where there is no text.
+
+    Raises:
+        DatasetError: no text is usable.
+    """
     readers: Sequence[tuple[str | None, Callable[[str, str], ScanSettings]]] = (
         (content.scan_settings, parse_scan_settings),
         (content.xre_settings, lambda text, name: parse_xre(text, name).settings),
@@ -376,10 +416,10 @@ def _require_one_each(content: Folder) -> None:
 
 
 def _require_one_circle(content: Folder) -> None:
-    """The texts state one pose; a tiled or helical scan needs flexdt.json.
+    """Check that the scan has one circular section; others need flexdt.json.
 
     Raises:
-        DatasetFormatError: the texts themselves say that there is more than one section.
+        DatasetFormatError: the texts state more than one section.
     """
     if content.xre_settings is None:
         return

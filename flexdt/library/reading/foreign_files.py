@@ -28,7 +28,8 @@ class ScanFormat:
         name: of the format or its maker.
         endings: of its files, in lower case.
         read: from a path and a geometry in place of the file's, or None, to the data set.
-        distant: whether `read` takes distances too, where the file has angles and pixels alone.
+        distant: whether `read` takes distances too, where the file has only angles and
+            pixels.
     """
 
     name: str
@@ -56,7 +57,7 @@ def open_file(
         distances: source to axis and to panel [mm].
 
     Raises:
-        DatasetError: another kind of file, or one that lacks what is needed; says what.
+        DatasetError: another kind of file, or one that lacks data; names them.
     """
     ending = path.suffix.lower()
     for form in SCAN_FORMATS:

@@ -14,12 +14,12 @@ from flexdt.twin.errors import TwinError
 MAX_HEAD_BYTES: Final = 16 << 20
 """Of a text that describes a scan."""
 TOLD: Final = 200
-"""Characters of a parser's own words that a message repeats."""
+"""Largest number of characters of a parser's error that a message repeats."""
 
 
 @contextmanager
 def parsing(path: Path, form: str) -> Iterator[None]:
-    """Turn what a parser raises into the file's error.
+    """Turn errors of a parser into the file's error.
 
     Args:
         path: the file.
@@ -42,7 +42,7 @@ def parsing(path: Path, form: str) -> Iterator[None]:
 
 
 def head_text(path: Path, most: int = MAX_HEAD_BYTES) -> str:
-    """A text that describes a scan, as UTF-8 with or without a byte order mark.
+    """Read a text that describes a scan, as UTF-8 with or without a byte order mark.
 
     Raises:
         DatasetFormatError: it has more than `most` bytes.
@@ -56,10 +56,10 @@ def head_text(path: Path, most: int = MAX_HEAD_BYTES) -> str:
 
 
 def require_memory(path: Path, what: str, size: int) -> None:
-    """Refuse what is to be read whole and does not fit into memory.
+    """Check that `what`, to be read in one piece, fits into memory.
 
     Raises:
-        DatasetFormatError: it does not.
+        DatasetFormatError: it does not fit.
     """
     most = memory_bytes()
     if size > most:

@@ -20,7 +20,7 @@ NO_DARK: Final = "no dark image"
 
 
 def in_order(content: Folder, names: Sequence[str], views: int) -> tuple[list[str], list[str]]:
-    """Images in the order of the numbers in their names.
+    """Sort images by the numbers in their names.
 
     Args:
         content: where they are.
@@ -28,8 +28,8 @@ def in_order(content: Folder, names: Sequence[str], views: int) -> tuple[list[st
         views: that the geometry has.
 
     Returns:
-        The names; those that are written otherwise than the rest are left out where there are as
-        many views as others. And what is doubtful about them.
+        The names, and doubts about them. Names of another form than the rest are left out
+        where the others are as many as the views.
 
     Raises:
         DatasetFormatError: two have one number.
@@ -47,10 +47,10 @@ def in_order(content: Folder, names: Sequence[str], views: int) -> tuple[list[st
 
 
 def doubts_of(content: Folder, geometry: ConeVec, shape: tuple[int, int]) -> list[str]:
-    """What is doubtful about the geometry of images.
+    """List doubts about the geometry of images.
 
     Raises:
-        DatasetFormatError: no scanner has it.
+        DatasetFormatError: no scanner has such a geometry.
     """
     found = examine(Operation.OPEN, geometry, shape)
     return settled(found, DatasetFormatError, str(content.path)) if found else []
@@ -69,7 +69,7 @@ def listed(
     full_scale: int | None = None,
     **known: Any,
 ) -> DataSet:
-    """The data set of images named one by one.
+    """Make the data set of images named one by one.
 
     Args:
         content: where they are.
@@ -78,12 +78,13 @@ def listed(
         name: of the data set; default: the folder's.
         shapes: (rows, cols) of each projection; default: all as the first that is there.
         reasons: why it is not complete.
-        warnings: what is doubtful.
-        full_scale: largest count of the panel, to say whether images are saturated; None: unknown.
+        warnings: doubts about it.
+        full_scale: largest count of the panel, to find saturated images; None: unknown.
         known: further members of `DataSet`.
 
     Raises:
-        DatasetError: none is there, or the geometry has another number of views or another shape.
+        DatasetError: no image is there, or the geometry has another number of views or
+            another shape.
     """
     if not shapes:
         there = [n for n in names if n in content.names]
@@ -131,7 +132,7 @@ def _first_look(
 
 
 def nothing_in(blank: Sequence[str]) -> str:
-    """Why images without anything recorded make a scan incomplete; "" where there are none."""
+    """Explain that blank images make a scan incomplete; "" without blank images."""
     if not blank:
         return ""
     more = f" to {blank[-1]}" if len(blank) > 1 else ""
@@ -140,7 +141,7 @@ def nothing_in(blank: Sequence[str]) -> str:
 
 
 def markers_alone(geometry: ConeVec, name: str) -> DataSet:
-    """A data set without images: geometry for markers.
+    """Make a data set without images: geometry for markers.
 
     Raises:
         TwinError: the geometry does not state the detector's size.

@@ -1,9 +1,10 @@
 """Read Nikon's .xtekct and the TIFFs beside it.
 
-As CIL's NikonDataReader 25.0 reads it (Apache-2.0; https://github.com/TomographicImaging/CIL):
-images are seen from behind the panel, column 0 at the right as seen from the source; the stage
-turns clockwise by `AngularStep` a view; images are counts under an open beam of `WhiteLevel`; the
-axis stands `ObjectOffsetX` to the left of the line from the source to the panel's middle.
+As CIL's NikonDataReader 25.0 reads it (Apache-2.0;
+https://github.com/TomographicImaging/CIL): images are seen from behind the panel, column
+0 at the right as seen from the source; the stage turns clockwise by `AngularStep` a view;
+images are counts under an open beam of `WhiteLevel`; the axis is `ObjectOffsetX` to the
+left of the line from the source to the panel's middle.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ def read_nikon(path: Path, geometry: ConeVec | None) -> DataSet:
         geometry: one view for each projection, in place of the file's.
 
     Raises:
-        DatasetError: the file lacks what is needed, or images are missing or of another shape.
+        DatasetError: the file lacks data, or images are missing or of another shape.
     """
     said = dict(LINE.findall(head_text(path)))
     views = int(_number(path, said, "Projections"))
@@ -87,7 +88,14 @@ def read_nikon(path: Path, geometry: ConeVec | None) -> DataSet:
 
 
 def _images(folder: Folder, views: int) -> tuple[list[str], list[str]]:
-    """The names of the projections by their numbers, lost ones among them; and what is doubtful.
+    """List the names of the projections by their numbers, missing ones included.
+
+    Args:
+        folder: of the images.
+        views: that the file states.
+
+    Returns:
+        The names, and doubts about them.
 
     Raises:
         DatasetFormatError: two have one number.
@@ -114,6 +122,17 @@ def _images(folder: Folder, views: int) -> tuple[list[str], list[str]]:
 
 
 def _number(path: Path, said: Mapping[str, str], key: str, default: float | None = None) -> float:
+    """Return a number of the file, with a decimal point or comma.
+
+    Args:
+        path: for the message.
+        said: keys and values of the file.
+        key: of the number.
+        default: where the key is missing; None makes that an error.
+
+    Raises:
+        DatasetFormatError: no finite number.
+    """
     text = said.get(key, "")
     try:
         if not text and default is not None:

@@ -1,4 +1,4 @@
-"""Read NeXus's NXtomo; `nxtomo_writing` says what flexdt adds to it."""
+"""Read NeXus's NXtomo; flexdt's additions are in `nxtomo_writing`."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ def read_nxtomo(
     Args:
         path: the file.
         geometry: one view for each projection; None: the rows of cone_vec in the file, or
-            what it says of angles, pixels and distances.
+            its angles, pixels and distances.
         distances: source to axis and to panel [mm], in place of the file's.
 
     Raises:
-        DatasetFormatError: no HDF5, no NXtomo, images that are not there, or no geometry.
+        DatasetFormatError: no HDF5, no NXtomo, missing images, or no geometry.
     """
     h5py = package("h5py", "NXtomo")
     try:
@@ -53,7 +53,16 @@ def read_nxtomo(
 def _read(
     file: Any, path: Path, geometry: ConeVec | None, distances: tuple[float, float] | None
 ) -> DataSet:
-    """Read the images of an open file, and their geometry."""
+    """Read the images of an open file, and their geometry.
+
+    Args:
+        file: open.
+        path: for messages.
+        geometry, distances: as for `read_nxtomo`.
+
+    Returns:
+        The data set in memory, with its doubts as warnings.
+    """
     name, doubts = _entry(file, path)
     group = file[name]
     data, keys = _images_of(group, path)
@@ -82,10 +91,13 @@ def _read(
 
 
 def _entry(file: Any, path: Path) -> tuple[str, list[str]]:
-    """The name of the group that holds images and their keys, and what is doubtful about it.
+    """Find the group that holds images and their keys.
+
+    Returns:
+        Its name, and doubts about it.
 
     Raises:
-        DatasetFormatError: there is none, or its images are a link that leads nowhere.
+        DatasetFormatError: there is no group, or its images are a broken link.
     """
     found: list[str] = []
     lost: list[str] = []
@@ -114,10 +126,10 @@ def _entry(file: Any, path: Path) -> tuple[str, list[str]]:
 
 
 def _images_of(group: Any, path: Path) -> tuple[Any, npt.NDArray[Any]]:
-    """The images, not yet read, and their keys.
+    """Return the images as an unread dataset of HDF5, and their keys (n,).
 
     Raises:
-        DatasetFormatError: they do not fit each other, are not there, or fit no memory.
+        DatasetFormatError: they do not fit each other, are missing, or exceed the memory.
     """
     data, keys = group["data"], np.asarray(group["image_key"])
     if data.ndim != 3 or keys.ndim != 1:
@@ -142,7 +154,7 @@ def _images_of(group: Any, path: Path) -> tuple[Any, npt.NDArray[Any]]:
 
 
 def _sources(data: Any) -> Iterator[str]:
-    """The files in which the images lie, where it is not the one that says so."""
+    """Iterate over the external files that hold the images."""
     if data.is_virtual:
         yield from dict.fromkeys(s.file_name for s in data.virtual_sources() if s.file_name != ".")
     if data.external:
@@ -157,7 +169,7 @@ def _geometry(
     shape: tuple[int, int],
     distances: tuple[float, float] | None,
 ) -> tuple[ConeVec, list[str]]:
-    """Take the rows of cone_vec in the file, or what its angles, pixel and distances say.
+    """Take the geometry from the file's cone_vec, or from its angles, pixel and distances.
 
     Args:
         file: with the entry.
@@ -168,10 +180,10 @@ def _geometry(
         distances: source to axis and to panel [mm], in place of the file's.
 
     Returns:
-        The geometry, and what is assumed of it.
+        The geometry, and the assumptions made.
 
     Raises:
-        DatasetFormatError: the file says too little; lists what is missing.
+        DatasetFormatError: the file states too little; lists the missing quantities.
     """
     entry = file[name.split("/")[0]]
     rows = next((g for g in (_member(file, "cone_vec"), _member(entry, "flexdt/cone_vec"))
@@ -216,17 +228,17 @@ LENGTHS: Final[Mapping[str, tuple[str, ...]]] = {
     "source distance": ("instrument/source/distance", "source/distance"),
     "detector distance": ("instrument/detector/distance", "distance"),
 }
-"""Lengths of NXtomo, distances from the sample, and where a file may have them, from its entry or
-group."""
+"""Length of NXtomo, distances from the sample -> its places in a file, from the entry or
+the group."""
 
 NEEDED: Final = ("x_pixel_size", "source distance", "detector distance")
-"""Lengths without which there is no geometry."""
+"""Lengths without which a geometry is undetermined."""
 
 
 def _angles(
     file: Any, name: str, projections: npt.NDArray[np.bool_]
 ) -> npt.NDArray[np.float64] | None:
-    """Angles of the projections [rad]; None where the file has not one for each image."""
+    """Read angles of the projections [rad]; None unless the file has one for each image."""
     entry, near = file[name.split("/")[0]], file[name]
     places = (near, entry, *(one for one in entry.values() if hasattr(one, "get")))
     for place in places:
@@ -240,7 +252,7 @@ def _angles(
 
 
 def _length(file: Any, name: str, *members: str) -> float | None:
-    """A length [mm] that the file states in one of some places; None where it has none."""
+    """Read a length [mm] from the first of some places that has it; None without any."""
     entry, near = file[name.split("/")[0]], file[name]
     for place in (entry, near):
         for member in members:
@@ -253,14 +265,24 @@ def _length(file: Any, name: str, *members: str) -> float | None:
 
 
 def _member(group: Any, name: str) -> Any:
-    """A member of a group, where it is one; None else."""
+    """Return a member of a group; None if there is no such member or no group."""
     return group.get(name) if hasattr(group, "get") else None
 
 
 def _stated(
     file: Any, name: str, geometry: ConeVec, projections: npt.NDArray[np.bool_]
 ) -> Iterator[Finding]:
-    """Compare the angles and the pixel that the file states with the geometry."""
+    """Compare the angles and the pixel that the file states with the geometry.
+
+    Args:
+        file: open.
+        name: of the group that holds the images.
+        geometry: in use.
+        projections: (n,) which images are projections.
+
+    Returns:
+        Findings of differences.
+    """
     turn = _angles(file, name, projections)
     if turn is not None:
         yield from angle_findings(geometry, turn)
@@ -276,6 +298,6 @@ def _stated(
 
 
 def _unit(dataset: Any, usual: str) -> str:
-    """The unit that an attribute states, or the usual one."""
+    """Return the unit that an attribute states, or the usual one."""
     said = dataset.attrs.get("units", usual)
     return said.decode() if isinstance(said, bytes) else str(said)

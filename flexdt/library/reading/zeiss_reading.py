@@ -27,9 +27,9 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray, rotation_z
 
 KINDS: Final = {3: "u1", 5: "<u2", 10: "<f4"}
-"""Xradia's numbers of types of pixels."""
+"""Xradia's number of a pixel type -> type of NumPy."""
 REFERENCES: Final = ("ReferenceData", "MultiReferenceData")
-"""Storages of images of the open beam, `Image` or `Image1` and so on."""
+"""Storages with images of the open beam, `Image` or `Image1` and so on."""
 NOT_APPLIED: Final = ("ImageInfo/CameraOffset", "ImageInfo/CameraFineRotation")
 GIVE: Final = ", or give it: geometry=ConeVec"
 
@@ -42,7 +42,7 @@ def read_zeiss(path: Path, geometry: ConeVec | None) -> DataSet:
         geometry: one view for each projection, in place of the file's.
 
     Raises:
-        DatasetFormatError: it is damaged, or lacks what is needed.
+        DatasetFormatError: it is damaged, or lacks data.
     """
     olefile = package("olefile", "Zeiss's .txrm")
     try:
@@ -69,7 +69,15 @@ class _Streams:
     def values(
         self, name: str, kind: str, count: int = 1, default: float | None = None, hint: str = ""
     ) -> npt.NDArray[Any]:
-        """The first numbers of a stream; where there is none, the default."""
+        """Read the first numbers of a stream; the default where the stream is missing.
+
+        Args:
+            name: of the stream.
+            kind: type of the numbers.
+            count: of numbers.
+            default: of a missing stream; None makes that an error.
+            hint: added to the message.
+        """
         there = self.ole.exists(name)
         if not there and default is not None:
             return np.full(count, default)
@@ -91,7 +99,7 @@ class _Streams:
         return out
 
     def lengths(self, name: str, count: int) -> FloatArray:
-        """Of `ImageInfo`, without their signs."""
+        """Read lengths (count,) of `ImageInfo`, without their signs."""
         found = abs(self.values(f"ImageInfo/{name}", "<f4", count, hint=GIVE).astype(np.float64))
         if not np.all((found > 0) & np.isfinite(found)):
             raise DatasetFormatError(f"{name} is {found.min():g}; allowed: above 0{GIVE}")
@@ -99,6 +107,17 @@ class _Streams:
 
 
 def _read(file: _Streams, geometry: ConeVec | None, name: str) -> DataSet:
+    """Read the images, reference and geometry of an open file into a data set.
+
+    Args:
+        file: its streams.
+        geometry: in place of the file's, or None.
+        name: of the data set.
+
+    Raises:
+        DatasetFormatError: the file claims more images than it holds, or floats without
+            reference.
+    """
     sizes = "ImageHeight", "ImageWidth", "NoOfImages", "DataType"
     rows, cols, planned, code = (file.whole(f"ImageInfo/{n}") for n in sizes)
     taken = min(file.whole("ImageInfo/ImagesTaken", planned), planned)
@@ -124,7 +143,7 @@ def _read(file: _Streams, geometry: ConeVec | None, name: str) -> DataSet:
 
 
 def _reference(file: _Streams, code: int, shape: tuple[int, int]) -> npt.NDArray[Any] | None:
-    """The images of the open beam, one or several."""
+    """Read the images of the open beam (k, rows, cols), None without any."""
     for folder in REFERENCES:
         names = [n for k in range(1000) if file.ole.exists(n := f"{folder}/Image{k or ''}")]
         if names:
@@ -136,7 +155,16 @@ def _reference(file: _Streams, code: int, shape: tuple[int, int]) -> npt.NDArray
 
 
 def _geometry(file: _Streams, views: int, rows: int) -> tuple[ConeVec, list[str]]:
-    """The geometry, and what is doubtful about it."""
+    """Read the geometry, and list doubts about it.
+
+    Args:
+        file: its streams.
+        views: that were taken.
+        rows: of an image.
+
+    Raises:
+        DatasetFormatError: a parallel beam, or a stage that rises.
+    """
     if file.whole("ImageInfo/XrayGeometry", 1) != 1:
         raise DatasetFormatError("XrayGeometry says a parallel beam; allowed: a cone beam")
     near, far = file.lengths("StoRADistance", views), file.lengths("DtoRADistance", views)

@@ -17,9 +17,10 @@ from flexdt.twin.reconstruction.acquisition.rectify import on_its_side
 from flexdt.twin.reconstruction.consistency.pixels import BadPixels, bad_pixels
 
 FEWEST: Final = 12
-"""Views of an object that turns, in which it is seen what stands still."""
+"""Smallest number of views in which bad pixels are told from a turning object."""
 MOST_KEPT_BYTES: Final = 128 << 20
-"""Line integrals that are kept between the passes over them; larger ones are made anew."""
+"""Largest line integrals kept between the passes over them [bytes]; larger ones are
+recomputed."""
 LEAST_TURN: Final = 0.2
 """Spread of the sources over their distance from the axis, at least, of a scan that turns."""
 
@@ -35,7 +36,7 @@ def without_bad_pixels(
         counts: gives those of a frame by its index.
 
     Returns:
-        The data set, and what a user has to be told.
+        The data set, and warnings for the user.
     """
     found = _bad_pixels(dataset, cone_vec, counts)
     if found is None:
@@ -46,6 +47,11 @@ def without_bad_pixels(
 def _bad_pixels(
     dataset: ImageSet, cone_vec: ConeVec, counts: Callable[[int], Counts]
 ) -> BadPixels | None:
+    """Find pixels that differ from their neighbours in all views.
+
+    Returns:
+        None with few views, no open beam, hardly any turn, or no bad pixels.
+    """
     present = np.array(dataset.present)
     if len(present) < FEWEST or not (dataset.flat > dataset.dark).any():
         return None

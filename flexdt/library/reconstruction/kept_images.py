@@ -1,7 +1,7 @@
-"""Images that are read once: what a reconstruction needs again is kept, in memory or on disk.
+"""Images that are read once; those needed again are kept, in memory or on disk.
 
-The file has no name from its first byte on (Windows deletes it when it is closed), so no end of the
-process leaves it behind, not even a kill.
+The file has no name from its first byte on (Windows deletes it when it is closed), so it
+goes with the process, even after a kill.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ class ImagesInMemory:
         self._images[number] = image
 
     def get(self, number: int, rows: slice = ALL) -> Float32Array:
-        """Rows of an image that is kept."""
+        """Return rows of a kept image."""
         return self._images[number][rows]
 
     def close(self) -> None:
-        """Keep none of them any longer."""
+        """Drop all images."""
         self._images.clear()
 
 
@@ -43,7 +43,7 @@ class ImagesOnDisk:
     """Images by number, in a file without a name.
 
     Args:
-        folder: in which its bytes lie.
+        folder: of the file.
         most_pixels: of an image.
 
     Raises:
@@ -57,7 +57,7 @@ class ImagesOnDisk:
         self._file: IO[bytes] = TemporaryFile(dir=folder, buffering=0)  # noqa: SIM115 (see close)
 
     def put(self, number: int, image: Float32Array) -> None:
-        """As `ImagesInMemory.put`.
+        """Keep an image, as `ImagesInMemory.put`.
 
         Raises:
             OSError: it cannot be written; names the folder.
@@ -72,7 +72,7 @@ class ImagesOnDisk:
         self._shapes[number] = image.shape[0], image.shape[1]
 
     def get(self, number: int, rows: slice = ALL) -> Float32Array:
-        """As `ImagesInMemory.get`.
+        """Return rows of a kept image, as `ImagesInMemory.get`.
 
         Raises:
             OSError: it cannot be read; names the folder.
@@ -131,7 +131,7 @@ class CountsOnce:
         return self._latest[index]
 
     def read_by(self, dataset: ImageSet) -> ImageSet:
-        """The same data set, whose counts come from here."""
+        """Return the data set with its counts read through this object."""
         held = dataset.arrays or Arrays(None)
         if held.counts is not None:  # in memory already
             self._looked_at.clear()
@@ -146,7 +146,7 @@ class KeptImages:
 
     Args:
         read: gives an image (rows, cols) by its number.
-        store: where they are kept.
+        store: keeps them.
         told: called after each image that is read.
     """
 
@@ -161,14 +161,14 @@ class KeptImages:
         self._prepared: set[int] = set()
 
     def image(self, number: int, *, again: bool) -> Float32Array:
-        """An image as it was read.
+        """Return an image as it was read.
 
         Args:
             number: of the image.
             again: keep it.
 
         Raises:
-            ValueError: another one has taken its place.
+            ValueError: its prepared image has replaced it.
         """
         if number in self._prepared:
             raise ValueError(f"image {number} is kept as prepared, no longer as it was read")
@@ -184,7 +184,7 @@ class KeptImages:
     def prepared(
         self, number: int, prepare: Callable[[int], Float32Array], rows: slice = ALL
     ) -> Float32Array:
-        """Rows of a prepared image.
+        """Return rows of a prepared image, preparing and keeping it the first time.
 
         Args:
             number: of the image.

@@ -1,4 +1,4 @@
-"""How much of a reconstruction is in memory at a time, and what lies on disk meanwhile."""
+"""The split of a reconstruction between memory and disk."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from flexdt.twin.errors import LimitError
 from flexdt.twin.projection import Grid
 
 PART: Final = 16
-"""Images that are worked on at a time."""
+"""Number of images processed at a time."""
 WORKING_IMAGES: Final = 100
-"""Images of four bytes a pixel that FDK takes beside a slab, at most
+"""Largest working memory of FDK in addition to a slab, in images of four bytes a pixel
 (`tests/studies/full_size.py --costs`: of an object that is cut off)."""
 KEPT_SHARE: Final = 0.25
-"""Of the memory, at most, for images that are needed again; more of them lie on disk."""
+"""Largest share of the memory for images that are needed again; above it they are on disk."""
 
 
 @dataclass(frozen=True)
 class MemoryPlan:
-    """How FDK divides its work.
+    """The division of FDK's work.
 
     Attributes:
         slabs: layers (first, last) of each.
         kept: images that are needed more than once.
         most_pixels: of an image that is kept.
-        on_disk: whether they lie in a file.
+        on_disk: whether they are in a file.
         prepared: whether images are prepared once, and kept for more passes than one.
     """
 
@@ -47,7 +47,7 @@ def plan_memory(
     """Divide a volume into as few slabs as fit into the memory.
 
     Args:
-        grid: of the volume.
+        grid: of the volume, (z, y, x) voxels.
         images: of the scan.
         again: images that are needed more than once even of a single slab.
         most_pixels: of an image that is kept.

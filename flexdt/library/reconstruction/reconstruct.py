@@ -84,14 +84,14 @@ if TYPE_CHECKING:
     from flexdt.twin.reconstruction import Bias, Hardening
 
 Progress = Callable[[float, float], None]
-"""Called with the work done and the whole, in the algorithm's own units."""
+"""Called with the work done and the total, in the algorithm's own units."""
 
 FREE_SHARE: Final = 0.5
-"""Of the free memory, that FDK uses where nobody says how much it may."""
+"""Share of the free memory that FDK uses by default."""
 PREVIEW_VIEWS: Final = 180
 PREVIEW_VOXELS: Final = 160
 SCATTER_VIEWS, SCATTER_PIXELS = 180, 100
-"""Frames, and about their pixels a side, from which it is found what scatters."""
+"""Number of frames, and about their pixels a side, to find the scattering object."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,8 @@ class VolumeRequest:
         window: of FDK's ramp filter.
         center_mm: (x, y, z) of the grid; None is the middle of the field of view, or the origin
             where `shape` is given.
-        rings: subtract what pixels add to all views, where that stands out from object and noise.
+        rings: subtract the offsets that pixels add to all views, where they exceed object
+            and noise.
         material: the object is made of this alone: correct beam hardening with the data set's
             tube (the default one where it names none); several with `sirt` and `sart` (see
             `Polychromatic`); None for no correction.
@@ -118,7 +119,7 @@ class VolumeRequest:
         weight: of the total variation (`tv`); None is its own default.
         scatter_correction: materials of the object: find their scatter and subtract it; None
             for no correction.
-        tube: of the scan, in place of what the data set says and of `kV`.
+        tube: of the scan, in place of the data set's and of `kV`.
     """
 
     algorithm: str = DEFAULT
@@ -149,10 +150,10 @@ class ScanFrames:
         binning: pixels a side that are averaged.
         rings: (rows, cols) to subtract from the line integrals, or None.
         harden: straightens line integrals of one material, or None.
-        mixture: what the spectrum does behind several, for iterations; or None.
+        mixture: beam hardening by several materials, for iterations; or None.
         scatter: of each of the m frames, to subtract, or None.
-        doubts: what is doubtful about the images, the trajectory and the corrections.
-        kept: where images that are needed again are kept; None reads them again.
+        doubts: about the images, the trajectory and the corrections.
+        kept: store of images that are needed again; None reads them again.
     """
 
     dataset: ImageSet
@@ -173,7 +174,7 @@ class ScanFrames:
         return rows // self.binning, cols // self.binning
 
     def parts(self) -> Iterator[Float32Array]:
-        """Line integrals of all frames, `PART` at a time, (k, rows, cols)."""
+        """Iterate over line integrals of all frames, `PART` at a time, (k, rows, cols)."""
         count = len(self.indices)
         for first in range(0, count, PART):
             numbers = range(first, min(first + PART, count))
@@ -181,15 +182,15 @@ class ScanFrames:
 
     @cached_property
     def truncation(self) -> Truncation | None:
-        """What of the object lies beyond the panel's edges, for FDK."""
+        """Estimate of the object beyond the panel's edges, for FDK."""
         return truncation_of(self.view, self.cone_vec, self.shape)
 
     def view(self, number: int, *, again: bool = True) -> Float32Array:
-        """One frame's line integrals, binned and corrected.
+        """Return one frame's line integrals, binned and corrected.
 
         Args:
             number: of the frame among those that are reconstructed.
-            again: keep what was read of it, where images are kept.
+            again: keep the image, where images are kept.
         """
         if self.kept is None:
             image = self.measured(self.dataset, number)
@@ -202,7 +203,7 @@ class ScanFrames:
         return image if self.harden is None else self.harden(image)
 
     def measured(self, dataset: ImageSet, number: int) -> Float32Array:
-        """One frame's line integrals, binned, read from a data set of the same frames."""
+        """Read one frame's line integrals, binned, from a data set of the same frames."""
         image = dataset.line_integrals(self.indices[number])
         return np.asarray(binned_mean(image, self.binning), np.float32)
 
@@ -210,7 +211,7 @@ class ScanFrames:
 def views_of(
     dataset: ImageSet, parameters: Offsets | None = None, *, binning: int = 1, every: int = 1
 ) -> ScanFrames:
-    """The frames that are there, and their geometry.
+    """Select the frames that are there, and compute their geometry.
 
     Args:
         dataset: from `load_dataset`.
@@ -218,7 +219,7 @@ def views_of(
         binning, every: see `VolumeRequest`.
 
     Raises:
-        LimitError: nothing would be left.
+        LimitError: no frame or pixel would be left.
     """
     rows, cols = dataset.shape
     most = max(1, min(rows, cols) // 2)
@@ -235,10 +236,10 @@ def views_of(
 
 
 def grid_of(views: ScanFrames, request: VolumeRequest) -> Grid:
-    """The grid of a requested volume.
+    """Choose the grid of a requested volume.
 
     Raises:
-        GeometryError: voxels that are too large for the field of view.
+        GeometryError: voxels too large for the field of view.
     """
     whole = field_of_view(views.cone_vec, views.shape, request.voxel_mm)
     if request.voxel_mm is not None and request.shape is None:
@@ -275,7 +276,7 @@ class ReconstructionTask:
 
     @cached_property
     def standing(self) -> StandingImages:
-        """The images as upright panels record them, for FDK; what lies beyond is not known yet."""
+        """The images as upright panels record them, for FDK, without truncation."""
         return StandingImages.of(self.views.cone_vec, self.views.shape, None)
 
     @cached_property
@@ -291,10 +292,10 @@ class ReconstructionTask:
         return min(some, count)
 
     def plan(self, memory: int | None, *, slabs: bool = True) -> MemoryPlan:
-        """How memory and disk are used.
+        """Decide on the use of memory and disk.
 
         Args:
-            memory: to use; None for half of what is free [bytes].
+            memory: to use; None for half of the free memory [bytes].
             slabs: whether the volume may be made in slabs.
 
         Raises:
@@ -324,7 +325,7 @@ def reconstruct_dataset(
     workers: AbstractContextManager[Executor] | None = None,
     memory: int | None = None,
 ) -> dict[str, Any]:
-    """Reconstruct a data set into a file, which appears under its name only when whole.
+    """Reconstruct a data set into a file, which appears under its name only when complete.
 
     Each image is read once, but by workers. Those that are needed again are kept in memory, or in a
     file without a name in the folder of `out`.
@@ -334,10 +335,10 @@ def reconstruct_dataset(
         out: the file: .tif, .nrrd, .mha, .nii.gz, .h5 or .zarr.
         request: the volume; None is FDK of the whole field of view.
         parameters: correction; None is the one in force during the scan, if any.
-        progress: called with the work done and the whole.
+        progress: called with the work done and the total.
         workers: make the slabs of FDK; they see the data set and `out` under the same paths. An
             interrupted reconstruction is taken up.
-        memory: that FDK may use; None for half of what is free [bytes].
+        memory: that FDK may use; None for half of the free memory [bytes].
 
     Returns:
         JSON-able: file, slices, algorithm, shape (z, y, x), voxel_mm, center_mm, frames, missing,
@@ -345,7 +346,7 @@ def reconstruct_dataset(
         seconds.
 
     Raises:
-        UnknownNameError: no such algorithm, window or material.
+        UnknownNameError: unknown algorithm, window or material.
         TwinError: beam hardening cannot be corrected, because the data set has none.
         LimitError: another ending, one of the data set's own files, a volume too large for this
             machine, or too little memory or room on disk.
@@ -398,7 +399,7 @@ def reconstruct_dataset(
 
 
 def _untold(done: float, total: float) -> None:
-    """Progress that is not reported."""
+    """Ignore progress."""
 
 
 def _bias(views: ScanFrames) -> Bias | None:
@@ -408,7 +409,18 @@ def _bias(views: ScanFrames) -> Bias | None:
 def _here(
     task: ReconstructionTask, plan: MemoryPlan, out: Path, slices: MiddleSlices, tell: Progress
 ) -> tuple[ScanFrames, Bias | None, list[str]]:
-    """Reconstruct into a file; returns the views, the bias of FDK and what is doubtful."""
+    """Reconstruct into a file in this process.
+
+    Args:
+        task: the reconstruction.
+        plan: of memory and disk.
+        out: the file.
+        slices: take the middle slices.
+        tell: called with the work done and the total.
+
+    Returns:
+        The views, the bias of FDK (None of other algorithms), and doubts.
+    """
     folder, grid = out.absolute().parent, task.grid
     _require_room_for_images(folder, plan, grid.bytes)
     with _reading_once(task, plan, folder, tell) as (kept, work), volume_writer(out, grid) as write:
@@ -437,7 +449,16 @@ def _fdk_slabs(
     *,
     errors: bool = False,
 ) -> Iterator[Volume]:
-    """The volume by FDK, slab after slab; images of a single one go into it as they are read."""
+    """Reconstruct by FDK, slab after slab; images of a single slab enter as they are read.
+
+    Args:
+        task: the reconstruction.
+        views: corrected frames.
+        kept: keeps prepared images.
+        plan: of slabs and memory.
+        work: gets the progress.
+        errors: estimate `sigma`.
+    """
     window = task.request.window
     if plan.prepared:
         images = replace(task.standing, truncation=views.truncation)
@@ -456,13 +477,13 @@ def _fdk_slabs(
 def _reading_once(
     task: ReconstructionTask, plan: MemoryPlan, folder: Path, tell: Progress
 ) -> Iterator[tuple[KeptImages, Work]]:
-    """Read each image once from here on, and tell of the work that is done.
+    """Read each image once from here on, and report the work done.
 
     Args:
         task: the reconstruction.
-        plan: what is in memory, and what in a file.
+        plan: the split between memory and a file.
         folder: of that file.
-        tell: called with what is done and the whole, in images; by FDK alone.
+        tell: called with the work done and the total, in images; by FDK only.
     """
     views, fdk = task.views, task.direct
     dataset = task.counts.read_by(views.dataset)
@@ -480,11 +501,17 @@ def reconstruct_volume(
     progress: Progress | None = None,
     errors: bool = False,
 ) -> Volume:
-    """Reconstruct a data set in memory; arguments and errors as for `reconstruct_dataset`, and
-    `errors` as for `fdk`.
+    """Reconstruct a data set in memory.
 
-    A volume by FDK that is too large for the memory lies in a file without a name in the folder for
+    A volume by FDK that exceeds the memory is in a file without a name in the folder for
     temporary files (TMPDIR); it has no `sigma`.
+
+    Args:
+        dataset, request, parameters, progress: as for `reconstruct_dataset`.
+        errors: as for `fdk`.
+
+    Raises:
+        TwinError: as `reconstruct_dataset`.
     """
     tell, folder = progress or _untold, Path(gettempdir())
     task = _task(dataset, request, parameters)
@@ -516,7 +543,9 @@ def reconstruct_volume(
 
 
 def _in_a_file(slabs: Iterator[Volume], grid: Grid, folder: Path) -> Volume:
-    """A volume whose values lie in a file without a name, which goes with them."""
+    """Collect slabs in a volume whose values are in a file without a name, deleted with
+    them.
+    """
     with TemporaryFile(dir=folder) as file:
         data = np.memmap(file, np.float32, "w+", shape=grid.shape)
     done = 0
@@ -530,7 +559,11 @@ def _in_a_file(slabs: Iterator[Volume], grid: Grid, folder: Path) -> Volume:
 def _task(
     dataset: ImageSet, request: VolumeRequest | None, parameters: Offsets | None
 ) -> ReconstructionTask:
-    """A request that can be met, its views, not yet corrected, and its grid."""
+    """Check a request, and make its task: views, not yet corrected, and grid.
+
+    Raises:
+        TwinError: the request cannot be met.
+    """
     wanted = VolumeRequest() if request is None else request
     name = wanted.algorithm
     if name not in ALGORITHMS:
@@ -562,9 +595,13 @@ def preview(
     parameters: Offsets | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """A quick look at a scan: few views, coarse pixels and voxels, FDK, slices as PNG.
+    """Reconstruct a quick look at a scan: few views, coarse pixels and voxels, FDK, PNG slices.
 
-    Arguments, result and errors as for `reconstruct_dataset`.
+    Args:
+        dataset, out, parameters, progress: as for `reconstruct_dataset`.
+
+    Returns:
+        As `reconstruct_dataset`.
     """
     whole = field_of_view(dataset.corrected(parameters), dataset.shape)
     coarser = max(1.0, max(whole.shape) / PREVIEW_VOXELS)
@@ -579,7 +616,12 @@ def preview(
 
 
 def _corrected(views: ScanFrames, request: VolumeRequest) -> ScanFrames:
-    """The views with the requested corrections."""
+    """Apply the requested corrections: scatter, rings and beam hardening.
+
+    Args:
+        views: uncorrected frames.
+        request: the volume.
+    """
     panel = views.dataset.panel
     if views.kept is not None and panel is not None and panel.lag:
         # Each image takes the one before, too: read in order, all are read once.
@@ -611,10 +653,15 @@ def _names(given: str | tuple[str, ...] | None) -> tuple[str, ...]:
 def _without_scatter(
     views: ScanFrames, names: tuple[str, ...], request: VolumeRequest
 ) -> ScanFrames:
-    """The views less the scatter of an object of these materials.
+    """Simulate the scatter of an object of these materials, to be subtracted from the views.
+
+    Args:
+        views: the frames.
+        names: of the materials.
+        request: gives the tube.
 
     Raises:
-        TwinError: the twin made them without scatter.
+        TwinError: the twin made the images without scatter.
     """
     from flexdt.phantoms import material
     from flexdt.twin.physics.chain import Chain
@@ -642,11 +689,11 @@ def _without_scatter(
 
 
 def _source(dataset: ImageSet, request: VolumeRequest) -> tuple[float, TubeModel, float | None]:
-    """Voltage, tube and single energy, as requested or as the data set names them.
+    """Return voltage, tube and single energy, as requested or as the data set names them.
 
     Raises:
-        LimitError: neither says the voltage.
-        TwinError: the data set's images know no beam hardening.
+        LimitError: neither states the voltage.
+        TwinError: the data set's images have no beam hardening.
     """
     from flexdt.twin.physics.tube import TubeModel
 
@@ -675,7 +722,7 @@ def _require_room(out: Path, grid: Grid) -> None:
     """Check, before any work, that the volume fits the disk and a layer of it the memory.
 
     Raises:
-        LimitError: says what is needed and what there is.
+        LimitError: names the needed and the free space.
     """
     folder = out.absolute().parent
     _require(f"free in {folder}", grid.bytes, free_bytes(folder), grid)
@@ -688,10 +735,10 @@ def _require_layer(grid: Grid) -> None:
 
 
 def _require_room_for_images(folder: Path, plan: MemoryPlan, volume_bytes: int) -> None:
-    """Check, before any work, that the images which are kept fit the disk beside the volume.
+    """Check, before any work, that the kept images and the volume fit the disk together.
 
     Raises:
-        LimitError: says what is needed and what there is.
+        LimitError: names the needed and the free space.
     """
     if not plan.on_disk:
         return
@@ -717,6 +764,7 @@ def _require(where: str, need: int, free: int, grid: Grid) -> None:
 
 
 def _iterative(views: ScanFrames, grid: Grid, request: VolumeRequest, tell: Progress) -> Volume:
+    """Reconstruct by an iterative algorithm, after checking that the memory suffices."""
     algorithm = ALGORITHMS[request.algorithm]
     stacks, grids = algorithm.stacks, algorithm.grids
     if views.mixture is not None:
@@ -739,7 +787,7 @@ def _iterative(views: ScanFrames, grid: Grid, request: VolumeRequest, tell: Prog
 
 
 def _stacked(views: ScanFrames) -> Float32Array:
-    """Line integrals of all frames, (n, rows, cols)."""
+    """Stack line integrals of all frames, (n, rows, cols)."""
     stack = np.empty((len(views.indices), *views.shape), np.float32)
     for number, image in enumerate(stack):
         image[:] = views.view(number, again=False)

@@ -1,4 +1,4 @@
-"""What the pixels of a scan add to all its views."""
+"""Offsets that the pixels of a scan add to all its views."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MOST_LEAN_PX: Final = 1.0
 """Columns between the axis at the panel's upper and lower edge, at most: beyond, columns on both
 sides of it do not see the same rays."""
 SECTORS: Final = 8
-"""Parts of a turn whose numbers of views are compared."""
+"""Number of parts of a turn whose numbers of views are compared."""
 MOST_UNEVEN: Final = 1.3
 """Views of the fullest sector over those of the emptiest, at most."""
 
@@ -26,7 +26,7 @@ MOST_UNEVEN: Final = 1.3
 def scan_rings(
     view: Callable[[int], Float32Array], cone_vec: ConeVec, shape: tuple[int, int]
 ) -> Float32Array:
-    """Find what each pixel of a scan adds to all views, to be subtracted from each.
+    """Estimate the offset that each pixel of a scan adds to all views, to be subtracted.
 
     Args:
         view: gives the line integrals of a view, (rows, cols), by its number.
@@ -34,7 +34,7 @@ def scan_rings(
         shape: (rows, cols).
 
     Returns:
-        (rows, cols); 0 where nothing stands out from object and noise.
+        (rows, cols); 0 where no offset exceeds object and noise.
     """
     lies = on_its_side(cone_vec)
     numbers = range(len(cone_vec))
@@ -44,7 +44,17 @@ def scan_rings(
 
 
 def _axis_column(cone_vec: ConeVec, shape: tuple[int, int], *, lies: bool) -> float | None:
-    """The column onto which the axis of a full turn falls, of an upright panel; else None."""
+    """Return the column of the axis of a full turn.
+
+    Args:
+        cone_vec: of all views.
+        shape: (rows, cols).
+        lies: whether the panel is on its side.
+
+    Returns:
+        None unless the turn is full and even, and the axis nearly parallel to the
+        columns.
+    """
     try:
         circle = circle_of(cone_vec)
     except GeometryError:
@@ -63,6 +73,6 @@ def _axis_column(cone_vec: ConeVec, shape: tuple[int, int], *, lies: bool) -> fl
 
 
 def _evenly_turned(circle: Circle) -> bool:
-    """Whether all directions have as many views: those of a turn and a half do not."""
+    """Check whether all directions have as many views: those of a turn and a half do not."""
     views, _ = np.histogram(circle.angle, SECTORS, (0.0, 2.0 * np.pi))
     return bool(views.max() <= MOST_UNEVEN * views.min() + 1.0)

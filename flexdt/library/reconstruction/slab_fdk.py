@@ -33,8 +33,8 @@ from flexdt.twin.reconstruction.acquisition.rectify import (
 from flexdt.twin.reconstruction.acquisition.trajectory import circle_of, narrow_overlap
 
 MARGIN: Final = 6
-"""Rows beside the shadow that a slab takes, too, so that a panel of many rows never seems to have
-few (`fdk_plan.FEW_ROWS`)."""
+"""Rows around the shadow that a slab takes too, so that a panel of many rows never seems
+to have few (`fdk_plan.FEW_ROWS`)."""
 VOXEL, FILTERED_PIXEL, READ_PIXEL = 1.0, 25.0, 12.0
 """Work of FDK a voxel and view, a pixel that is filtered and one that is read and prepared, in
 units of the first (`tests/studies/full_size.py --costs`)."""
@@ -50,7 +50,7 @@ class StandingImages:
         cone_vec: of the standing images.
         shape: of these, (rows, cols).
         rises: whether the scan is a helix, whose views take whole images.
-        truncation: what lies beyond the panel's edges.
+        truncation: estimate of the object beyond the panel's edges.
     """
 
     recorded: ConeVec
@@ -64,15 +64,15 @@ class StandingImages:
     def of(
         cls, cone_vec: ConeVec, shape: tuple[int, int], truncation: Truncation | None
     ) -> StandingImages:
-        """Of a scan.
+        """Make the upright images of a scan.
 
         Args:
             cone_vec: of all views.
             shape: of the images as recorded, (rows, cols).
-            truncation: what lies beyond the panel's edges.
+            truncation: estimate of the object beyond the panel's edges.
 
         Raises:
-            GeometryError: neither a circle nor a helix, or a panel that lies flat.
+            GeometryError: neither a circle nor a helix, or a flat panel.
         """
         circle = circle_of(cone_vec)
         turned = on_its_side(cone_vec)
@@ -87,7 +87,7 @@ class StandingImages:
         return cls(cone_vec, turned, level, (rows, wide), rises, truncation)
 
     def stood(self, image: Float32Array, number: int) -> Float32Array:
-        """The image of a view as an upright panel would have recorded it."""
+        """Return the image of a view as an upright panel would have recorded it."""
         if self.turned:
             image = image.T
         if self.cone_vec is self.recorded:
@@ -98,14 +98,14 @@ class StandingImages:
         return stood
 
     def rows(self, like: Volume) -> slice:
-        """Rows in which a slab's shadow lies in some view."""
+        """Return the rows with a slab's shadow in some view."""
         if self.rises or not is_upright(self.cone_vec):
             return slice(0, self.shape[0])
         first, last = rows_needed(self.cone_vec, self.shape, like)
         return slice(max(first - MARGIN, 0), min(last + MARGIN, self.shape[0]))
 
     def part(self, rows: slice) -> tuple[ConeVec, tuple[int, int], Truncation | None]:
-        """Geometry, shape and truncation of some rows."""
+        """Return geometry, shape and truncation of some rows."""
         shape = rows.stop - rows.start, self.shape[1]
         if shape == self.shape:
             return self.cone_vec, self.shape, self.truncation
@@ -131,12 +131,12 @@ def fdk_slabs(
 
     Args:
         view: gives the corrected image of a view as recorded.
-        kept: where prepared images are kept.
-        images: how they stand.
-        grid: of the whole volume.
+        kept: keeps prepared images.
+        images: geometry of the upright images.
+        grid: of the entire volume.
         slabs: layers (first, last) of each.
         filter_window: of the ramp filter.
-        tell: called with the slab's number and the part of it that is done.
+        tell: called with the slab's number and the part of it done, 0 to 1.
         errors: give each its `sigma` (circles).
     """
 
@@ -166,13 +166,13 @@ def _parts(count: int) -> list[range]:
 
 
 class Work:
-    """The work of a reconstruction that is done, in images: a whole one is in every slab.
+    """Progress of a reconstruction, in images; an image is complete when it is in every slab.
 
     Args:
         images: of the scan.
         reading: work of reading and preparing them all.
         slabs: work of each slab.
-        tell: called with what is done and the whole, in images.
+        tell: called with the work done and the total, in images.
     """
 
     def __init__(
@@ -193,7 +193,14 @@ class Work:
         slabs: Sequence[tuple[int, int]],
         tell: Callable[[float, float], None],
     ) -> Work:
-        """Of slabs of a grid."""
+        """Estimate the work of slabs of a grid.
+
+        Args:
+            images: upright.
+            grid: of the entire volume.
+            slabs: layers (first, last) of each.
+            tell: called with the work done and the total.
+        """
         count, (rows, cols) = len(images.cone_vec), images.shape
         work = []
         for first, last in slabs:
@@ -204,12 +211,12 @@ class Work:
         return cls(count, READ_PIXEL * count * rows * cols, work, tell)
 
     def read(self) -> None:
-        """One image more has been read."""
+        """Count one more image as read."""
         self._read += 1
         self._say()
 
     def slab(self, number: int, part: float) -> None:
-        """A part of a slab, from 0 to 1, is done."""
+        """Set the part of a slab that is done, from 0 to 1."""
         self._done[number] = part
         self._say()
 

@@ -1,7 +1,8 @@
-"""Volumes to files and from them, slab by slab, in the formats of `volume_formats`; slices as PNG.
+"""Read and write volume files, slab by slab, in the formats of `volume_formats`; slices as PNG.
 
-A file appears under its final name only when whole. Values are float32 [1/mm], index order z, y, x;
-voxel size and position go into the file where its format has a place for them.
+A file appears under its final name only when complete. Values are float32 [1/mm], index
+order z, y, x; voxel size and position go into the file where its format has a place for
+them.
 """
 
 from __future__ import annotations
@@ -36,10 +37,12 @@ NO_PLACE: Final = (
 
 @contextmanager
 def volume_writer(path: Path, grid: Grid | VoxelPlaces) -> Iterator[Sink]:
-    """Open `path` for a volume on `grid`; the ending chooses the format.
+    """Open `path` for a volume on `grid`, and yield the function that takes its slabs;
+    the ending chooses the format.
 
     Raises:
-        LimitError: another ending, a folder that is not there, or voxels that the format has not.
+        LimitError: another ending, a missing folder, or voxels that the format does not
+            allow.
         TwinError: the package that writes the format is not installed.
         OSError: the file cannot be written.
     """
@@ -67,14 +70,14 @@ def endings() -> list[str]:
 
 
 def ending(path: Path) -> str:
-    """What says the format: the last part of the name, with two dots for .nii.gz."""
+    """Return the ending that names the format: the last part, or .nii.gz."""
     name = path.name.lower()
     known = [ending for ending in endings() if name.endswith(ending) and name != ending]
     return max(known, key=len, default=path.suffix.lower())
 
 
 def check_name(path: Path) -> VolumeFormat:
-    """The format of a file of this name; checks, before any work, that it can be written."""
+    """Return the format of a file name; checks, before any work, that it can be written."""
     form = _format(path)
     if not path.absolute().parent.is_dir():
         raise LimitError(f"{path}: the folder does not exist", {"asked": str(path.parent)})
@@ -95,13 +98,13 @@ def _format(path: Path) -> VolumeFormat:
 
 
 def save_volume(volume: Volume, file: File) -> None:
-    """See `Volume.save`."""
+    """Write a volume to a file; see `Volume.save`."""
     with volume_writer(Path(file), VoxelPlaces.of(volume)) as write:
         write(volume.data)
 
 
 def read_volume(file: File) -> Volume:
-    """A volume with its place, from a file that `volume_writer` made.
+    """Read a volume with its place, from a file that `volume_writer` made.
 
     Raises:
         OSError: it cannot be read.
@@ -160,8 +163,8 @@ class MiddleSlices:
         }
 
     def write(self, path: Path) -> list[Path]:
-        """Write PNG files beside `path`, named after all of its name (so those of `v.tif` and
-        `v.nrrd` keep apart); returns their paths.
+        """Write PNG files next to `path`, named after all of its name (so those of
+        `v.tif` and `v.nrrd` differ); returns their paths.
 
         All three share one grey scale: the 0.5th and 99.5th percentile of their values.
         """

@@ -45,7 +45,7 @@ first voxel's or the middle."""
 
 @dataclass(frozen=True)
 class VoxelPlaces:
-    """Where the voxels of a file lie.
+    """Positions of the voxels of a file.
 
     Attributes:
         shape: (nz, ny, nx).
@@ -105,8 +105,8 @@ class VolumeFormat:
 
     Attributes:
         endings: of its files, in lower case; the first is the usual one.
-        write: from (unfinished file, final path, places): yields what takes the slabs; afterwards
-            the unfinished file is whole and gets its final path.
+        write: from (unfinished file, final path, places): yields the function that takes
+            slabs; afterwards the unfinished file is complete and gets its final path.
         read: from a path; ValueError and its like where the file is of another kind.
         require: raises TwinError where a package that the format needs is not installed.
         oblong: whether its voxels may have three edges.
@@ -156,14 +156,19 @@ def _raw(file: IO[bytes] | gzip.GzipFile) -> Sink:
 
 
 def _blocks(slab: Float32Array) -> Iterator[Float32Array]:
-    """Layers of a slab in the order of a file, some at a time: FDK's lie across it."""
+    """Yield layers of a slab in the order of a file, some at a time: FDK's order is another."""
     layers = max(1, BLOCK_BYTES // max(slab[:1].nbytes, 1))
     for first in range(0, len(slab), layers):
         yield np.ascontiguousarray(slab[first : first + layers], dtype="<f4")
 
 
 def _write_tiff(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
-    """Write a page for each layer, with voxel and place in the first page's description."""
+    """Write a page for each layer, with voxel and place in the first page's description.
+
+    Args:
+        part: the unfinished file.
+        places: of the voxels.
+    """
     import tifffile
 
     grid = places.grid
@@ -257,7 +262,12 @@ def _nifti_header(places: VoxelPlaces) -> bytes:
 
 
 def _write_hdf5(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
-    """Write one data set, `volume`, with its place as attributes."""
+    """Write one data set, `volume`, with its place as attributes.
+
+    Args:
+        part: the unfinished file.
+        places: of the voxels.
+    """
     grid = places.grid
     with _h5py().File(part, "w") as file:
         values = file.create_dataset("volume", grid.shape, "f4")
@@ -275,7 +285,9 @@ def _write_hdf5(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
 
 
 def _header(path: Path, between: str, end: bytes) -> tuple[dict[str, str], int]:
-    """Fields of a header that goes on until `end`, and where the values begin behind it."""
+    """Read the fields of a header that ends with `end`, and the offset [bytes] of the
+    values.
+    """
     with path.open("rb") as file:
         head, found, _ = file.read(HEADER_BYTES).partition(end)
     if not found:
@@ -341,7 +353,7 @@ def _zarr() -> Any:
 
 
 def _write_zarr(part: Path, path: Path, places: VoxelPlaces) -> Iterator[Sink]:
-    """Write what the extension writes."""
+    """Write by the function of the extension."""
     yield from _zarr().write(part, path, places.grid)
 
 
