@@ -1,13 +1,14 @@
-"""`TwinClient` and `AsyncTwinClient`: the twin server's methods, blocking and as coroutines.
+"""`TwinClient` and `AsyncTwinClient`: the twin server's methods, blocking and as
+coroutines.
 
-`Core` is a client's connection policy: greet, reconnect with back-off, subscribe again. A call that
-only reads is repeated after a reconnect. One that acts is repeated only if it was never sent;
-otherwise the caller gets an error that says that its outcome is unknown. So no move is ever
-repeated silently.
+`Core` is a client's connection policy: greet, reconnect with back-off, subscribe again. A
+call that only reads is repeated after a reconnect. A call that acts is repeated only if
+it was never sent; otherwise the caller gets an error: the outcome is unknown. So no move
+is ever repeated silently.
 
-`TwinClient` waits for what an `AsyncTwinClient` does on an event loop in a thread of its own, one
-for all clients of the process. So it works in scripts, in threads and in a notebook whose own event
-loop is running.
+`TwinClient` runs an `AsyncTwinClient` on an event loop in a thread of its own, one for
+all clients of the process. So it works in scripts, in threads and in a notebook whose own
+event loop is running.
 """
 
 from __future__ import annotations
@@ -58,15 +59,15 @@ class Listener(Protocol):
         """Take an event's params."""
 
     def connection_lost(self) -> None:
-        """The connection has ended; the client may reconnect."""
+        """Handle the end of the connection; the client may reconnect."""
 
     def end(self) -> None:
-        """No more events will come."""
+        """End the stream: no more events will come."""
 
 
 @dataclass(eq=False)
 class Core:
-    """A client's connection and what it keeps between calls.
+    """A client's connection and the state it keeps between calls.
 
     Attributes:
         transport: to the server.
@@ -93,7 +94,7 @@ class Core:
     _connecting: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     async def connected(self) -> Link:
-        """A link that is alive.
+        """Return a live link; connect first if there is none.
 
         Raises:
             ConnectionLost: no server answers, or the client is closed.
@@ -105,7 +106,12 @@ class Core:
             return await self._join()
 
     async def call(self, asked: Ask) -> object:
-        """The result of a method, not yet decoded.
+        """Call a method of the server and return its result, not yet decoded.
+
+        A call that only reads is sent up to `ATTEMPTS` times over lost connections.
+
+        Args:
+            asked: method, params and time limit; a negative limit is the client's own.
 
         Raises:
             RpcError: the server's answer is an error.
@@ -184,7 +190,7 @@ class Core:
             await link.close()
 
     def _deliver(self, params: Mapping[str, object]) -> None:
-        """Pass an event's params to its listeners."""
+        """Send an event's params to the listeners of its topic."""
         topic = params.get("topic")
         for listener in list(self._listeners):
             if topic in listener.topics:
@@ -196,7 +202,14 @@ class Core:
             listener.connection_lost()
 
     async def _join(self) -> Link:
-        """Connect, unless another call has done so meanwhile."""
+        """Connect, unless another call has done so meanwhile.
+
+        Attempts go on with back-off for `wait_s` the first time, for `reconnect_s` later.
+
+        Raises:
+            ConnectionLost: no server answers in that time, or the client is closed.
+            RpcError: the server refuses the client.
+        """
         clock = asyncio.get_running_loop().time
         deadline = clock() + (self.wait_s if self.hello is None else self.reconnect_s)
         pauses = back_off()
@@ -214,6 +227,15 @@ class Core:
                 await asyncio.sleep(pause)
 
     async def _greet(self) -> Link:
+        """Open a connection, greet the server and subscribe the listeners again.
+
+        Returns:
+            The link; `hello` is set to the server's answer.
+
+        Raises:
+            ConnectionLost: no connection, or the client was closed meanwhile.
+            RpcError: the server refuses the client; the connection is closed.
+        """
         await self.transport.open()
         link = Link(self.transport, self._deliver, self._ended)
         try:
@@ -256,6 +278,12 @@ class ClientMethod(Generic[_P, _R]):
     """
 
     def __init__(self, make: Callable[_P, Flow[_R]]) -> None:
+        """Make the blocking and the asynchronous method of a function, with its
+        signature.
+
+        Args:
+            make: returns the flow of a call; see `twin_methods`.
+        """
         made = inspect.signature(make)
         shows = "progress" in made.parameters and made.parameters["progress"].annotation in SHOWN
 
@@ -265,13 +293,13 @@ class ClientMethod(Generic[_P, _R]):
 
         @functools.wraps(make)
         async def awaited(self: AsyncTwinClient, /, *args: _P.args, **kwargs: _P.kwargs) -> _R:
-            # Others' work goes on in this thread meanwhile: a bar would stand for all of it.
+            # Other coroutines run in this thread meanwhile: a bar would mix with their output.
             if shows and "progress" not in made.bind_partial(*args, **kwargs).arguments:
                 kwargs["progress"] = False
             return await self.run(make(*args, **kwargs))
 
         self._methods: dict[bool, Any] = {False: blocking, True: awaited}
-        # What help() and notebooks show: with self, without Flow.
+        # Signature for help() and notebooks: with self, without Flow.
         own = inspect.Parameter("self", inspect.Parameter.POSITIONAL_ONLY)
         returns = str(made.return_annotation).removeprefix("Flow[").removesuffix("]")
         parameters = [own, *made.parameters.values()]
@@ -426,7 +454,8 @@ class AsyncTwinClient(SharedMethods):
         projection_binning: int | None = None,
         max_queue: int = 256,
     ) -> AsyncSubscription:
-        """Events of `topics` (default: state), for `async with` and `async for`.
+        """Return a subscription to `topics` (default: state), for `async with` and `async
+        for`.
 
         Args:
             topics: state, projection, job, log.
@@ -474,7 +503,8 @@ if hasattr(os, "register_at_fork"):  # a forked process has no thread that runs 
 
 
 def _result(work: Coroutine[Any, Any, _R]) -> _R:
-    """What `work` returns on the loop; an interrupt of the thread that waits here cancels it."""
+    """Run `work` on the clients' loop and return its result; an interrupt here cancels
+    it."""
     doing = asyncio.run_coroutine_threadsafe(work, _loop())
     try:
         return doing.result()
@@ -558,7 +588,8 @@ class TwinClient(SharedMethods):
         projection_binning: int | None = None,
         max_queue: int = 256,
     ) -> Subscription:
-        """Events of `topics` (default: state), to iterate over.
+        """Subscribe to `topics` (default: state) and return an iterator over their
+        events.
 
         Args:
             topics: state, projection, job, log.

@@ -72,7 +72,7 @@ class Projection:
         )
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:
-        """The pixels, so that `numpy.asarray(projection)` is the image."""
+        """Return the pixels, so that `numpy.asarray(projection)` is the image."""
         if copy or (dtype is not None and np.dtype(dtype) != self.image.dtype):
             return np.array(self.image, dtype=dtype)
         return self.image
@@ -83,7 +83,8 @@ class Projection:
         return f"<Projection {cols} x {rows} {self.image.dtype}, {self.kind}{at}>"
 
     def _repr_png_(self) -> bytes:
-        """PNG for notebooks: dense parts dark, windowed between percentiles, marks in colour."""
+        """Return a PNG for notebooks: dense parts dark, windowed between percentiles,
+        marks in colour."""
         from flexdt.library.datasets.pictures import png
 
         return png(self.image, dark_is_dense=self.kind == "line_integral", marks=self.marks)
@@ -107,7 +108,10 @@ class Event:
 
     @classmethod
     def from_wire(cls, params: Mapping[str, object]) -> Event:
-        """Validate the params of an event.
+        """Validate the params of an event and build it.
+
+        Args:
+            params: topic, seq, time and data, as decoded from the wire.
 
         Raises:
             RpcError: they are not an event of the protocol.
@@ -173,7 +177,10 @@ class AsyncSubscription:
         return await self.next()
 
     async def next(self, timeout_s: float | None = None) -> Event:
-        """The next event.
+        """Wait for the next event and return it; reconnect after a lost connection.
+
+        Args:
+            timeout_s: time limit [s]; None waits for ever.
 
         Raises:
             TimeoutError: none came in time.
@@ -221,12 +228,12 @@ class AsyncSubscription:
         self._stirred.set()
 
     def connection_lost(self) -> None:
-        """The client's connection has ended (called by the client)."""
+        """Mark the connection as lost; `next` reconnects (called by the client)."""
         self._lost = True
         self._stirred.set()
 
     def end(self) -> None:
-        """Nothing will come any more (called by the client)."""
+        """End the iteration after the events at hand (called by the client)."""
         self._closed = True
         self._stirred.set()
 
@@ -264,7 +271,7 @@ class Subscription:
         return self.next()
 
     def next(self, timeout_s: float | None = None) -> Event:
-        """The next event.
+        """Wait for the next event and return it.
 
         Raises:
             TimeoutError: none came in time.

@@ -19,7 +19,7 @@ _R = TypeVar("_R")
 _M = TypeVar("_M", bound=Result)
 
 OWN_PATIENCE: Final = -1.0
-"""As a timeout: the client's own."""
+"""Time limit that selects the client's own [s]."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def ask(
 
 
 def sample_shape() -> Flow[scanner.SampleMeshResult]:
-    """The mesh of the sample on the stage, with the name and the revision that it is of."""
+    """Fetch the mesh of the sample on the stage, with its name and revision."""
     while True:
         content, first = b"", None
         while first is None or len(content) < first.total:
@@ -105,7 +105,12 @@ def drive(flow: Flow[_R], perform: Callable[[Effect], object]) -> _R:
 
 
 async def perform(effect: Effect, call: Callable[[Ask], Awaitable[object]]) -> object:
-    """Perform an effect on an event loop; `call` asks the server."""
+    """Perform an effect on an event loop and return its result.
+
+    Args:
+        effect: a request, a pause or a call of the caller's function.
+        call: sends a request to the server and returns the result.
+    """
     match effect:
         case Ask():
             return await call(effect)

@@ -1,8 +1,10 @@
-"""A connection to the twin that is kept for as long as a program runs: for the viewer and gateway.
+"""A connection to the twin that is kept for as long as a program runs: for the viewer and
+gateway.
 
-Built on the asynchronous client, with two differences that such programs need. It reconnects by
-itself, not with the next call; and a request fails at once while there is no connection, and is
-never repeated: the person at the page decides whether to ask again.
+Built on the asynchronous client, with two differences that such programs need. It
+reconnects by itself, not with the next call; and a request fails at once while there is
+no connection, and is never repeated: the user of the page decides whether to send it
+again.
 """
 
 from __future__ import annotations
@@ -95,7 +97,7 @@ class KeptConnection:
 
     @property
     def hello(self) -> HelloResult | None:
-        """What the twin reported about itself; None while there is no connection."""
+        """The twin's answer to the greeting; None while there is no connection."""
         return self._client.core.hello if self.connected else None
 
     async def run(self) -> None:
@@ -142,10 +144,10 @@ class KeptConnection:
             log("an event could not be handled", logging.ERROR, error=True)
 
     def connection_lost(self) -> None:
-        """The connection has ended; `run` makes the next one."""
+        """Do nothing: `run` makes the next connection."""
 
     def end(self) -> None:
-        """Nothing to do: the connection is not closed for good."""
+        """Do nothing: the connection is not closed for good."""
 
     def _change(self, problem: str) -> None:
         self.problem = problem

@@ -45,7 +45,8 @@ class ConnectionLost(ConnectionError):
 
     @classmethod
     def of(cls, calls: Correlation[Any], *, sent: bool) -> ConnectionLost:
-        """The error of a request whose connection has ended, with the reason if one is known."""
+        """Build the error of a request whose connection has ended, with the reason if
+        one is known."""
         if calls.violation is not None:
             return cls(f"the server broke the protocol: {calls.violation}", sent=sent)
         why = "" if calls.reason is None else f": {calls.reason.message}"
@@ -62,7 +63,8 @@ class Transport(Protocol):
         """Send one message, or raise `ConnectionLost`."""
 
     async def receive(self) -> list[Message]:
-        """At least one message; empty only when the connection has ended.
+        """Wait for messages: at least one; an empty list only when the connection has
+        ended.
 
         Raises:
             ProtocolError: the server ended the connection inside a message.
@@ -73,16 +75,16 @@ class Transport(Protocol):
 
 
 class TcpTransport:
-    """Streams of asyncio.
+    """Transport over TCP by asyncio streams, plain or with TLS.
 
     Args:
         host, port: of the server.
-        codec: what to speak; MessagePack carries images without base64.
-        timeout_s: for connecting.
-        ssl: a client's TLS context; None speaks plain TCP.
+        codec: of the messages; MessagePack carries images without base64.
+        timeout_s: for connecting [s].
+        ssl: a client's TLS context; None for plain TCP.
 
     Raises:
-        ValueError: no server can be at the port.
+        ValueError: the port is outside the allowed range.
     """
 
     def __init__(
@@ -105,7 +107,11 @@ class TcpTransport:
         return f"TcpTransport({self.host!r}, {self.port}, codec={self.codec})"
 
     async def open(self) -> None:
-        """Connect anew."""
+        """Connect to the server; an earlier connection is closed.
+
+        Raises:
+            ConnectionLost: no server answers at the address.
+        """
         self.close()
         try:
             async with asyncio.timeout(self.timeout_s):
@@ -124,7 +130,12 @@ class TcpTransport:
         self._wire = Connection(self.codec)
 
     async def send(self, message: Message) -> None:
-        """Send one message; the bytes are handed over whole, so a cancelled call breaks nothing."""
+        """Send one message; all its bytes are queued at once, so a cancelled call breaks
+        nothing.
+
+        Raises:
+            ConnectionLost: there is no connection, or it has ended.
+        """
         data = self._wire.send(message)
         if self._streams is None:
             raise ConnectionLost(f"not connected to {self.host}:{self.port}")
@@ -139,7 +150,11 @@ class TcpTransport:
             ) from error
 
     async def receive(self) -> list[Message]:
-        """Messages, or an empty list at the end."""
+        """Wait for messages and return them; an empty list at the end of the connection.
+
+        Raises:
+            ProtocolError: the server ended the connection inside a message.
+        """
         messages: list[Message] = []
         while not messages:
             streams = self._streams
@@ -193,6 +208,11 @@ class Link:
     ) -> object:
         """Send a request and wait for its result.
 
+        Args:
+            method: name of the method.
+            params: its parameters by name.
+            timeout_s: time limit for the answer [s]; None for none.
+
         Raises:
             RpcError: the server's answer is an error.
             ConnectionLost: the connection ended; `.sent` says whether the request had been sent.
@@ -231,6 +251,7 @@ class Link:
         await self.ended()
 
     async def _read(self) -> None:
+        """Handle messages until the connection ends, then fail all open requests."""
         try:
             while messages := await self._transport.receive():
                 for message in messages:

@@ -39,13 +39,13 @@ Kind = Literal["line_integral", "counts"]
 SpeedUp = float | Literal["max"]
 Positions = Mapping[str, float]
 Job = str | scans.SubmitResult | s.JobStatus
-"""A job by its name, or what submitted it or told of it."""
+"""A job: its name, or the result of submitting it, or its status."""
 
 ScanProgress = Callable[[s.JobStatus], object] | bool | None
-"""None or True for a bar of frames, False for silence, or what is called with each status."""
+"""None or True for a bar of frames, False for silence, or a function of each status."""
 
 CHUNK: Final = 4 * 2**20
-"""Bytes in one message of an upload: below a frame, also as base64."""
+"""Size of one message of an upload [bytes]: below a frame, also as base64."""
 SCENE_FORMATS: Final = get_args(scanner.SceneFormat)
 MESH_FORMATS: Final = get_args(scanner.MeshFormat)
 FINAL_STATES: Final[tuple[s.EndedPhase, ...]] = get_args(s.EndedPhase)
@@ -73,7 +73,7 @@ def ping() -> Flow[float]:
 
 
 def discover() -> Flow[dict[str, Any]]:
-    """The server's methods as an OpenRPC document.
+    """Return the server's methods as an OpenRPC document.
 
     Example:
         >>> "axes.move" in [method["name"] for method in twin.discover()["methods"]]
@@ -86,7 +86,7 @@ def discover() -> Flow[dict[str, Any]]:
 
 
 def state() -> Flow[s.State]:
-    """Everything, as one snapshot.
+    """Return the complete state as one snapshot.
 
     Example:
         >>> twin.state().axes["rot_obj"].unit
@@ -153,7 +153,7 @@ def set_axis(
 
 
 def stop() -> Flow[s.Stopped]:
-    """Bring all axes to rest; the answer says how long and how far that takes.
+    """Bring all axes to rest; the result has the time and the way that this takes.
 
     Example:
         >>> twin.stop().safety.estop
@@ -163,7 +163,7 @@ def stop() -> Flow[s.Stopped]:
 
 
 def estop() -> Flow[s.Stopped]:
-    """Emergency stop; the answer says how the motors come to rest.
+    """Send an emergency stop; the result describes how the motors come to rest.
 
     Example:
         >>> twin.estop().safety.estop, twin.reset().safety.estop
@@ -204,7 +204,7 @@ def set_clock(speed_up: SpeedUp) -> Flow[s.ClockState]:
 def set_tube(
     *, kV: float | None = None, power_W: float | None = None, on: bool | None = None
 ) -> Flow[s.TubeState]:
-    """Set the X-ray tube; what is left out stays.
+    """Set the X-ray tube; parameters left out keep their values.
 
     Example:
         >>> tube = twin.set_tube(kV=80.0, power_W=20.0)
@@ -222,7 +222,8 @@ def set_camera(
     averages: int | None = None,
     frames: int | None = None,
 ) -> Flow[s.CameraState]:
-    """Set the camera; what is left out stays. `roi`: left, top, right, bottom, unbinned.
+    """Set the camera; parameters left out keep their values. `roi`: left, top, right,
+    bottom, unbinned.
 
     Example:
         >>> twin.set_camera(exposure_ms=200.0).exposure_ms
@@ -238,7 +239,7 @@ def set_camera(
 
 
 def samples() -> Flow[scanner.SampleListResult]:
-    """All samples that may be set, and the materials of meshes.
+    """List all samples that may be set, and the materials of meshes.
 
     Example:
         >>> "lego" in [sample.name for sample in twin.samples().samples]
@@ -271,7 +272,7 @@ def set_sample(
 
 
 def delete_sample(name: str) -> Flow[scanner.SampleDeleteResult]:
-    """Delete an upload that neither stands on the stage nor is in a scan that has not ended.
+    """Delete an upload that is neither on the stage nor in a scan that has not ended.
 
     Example:
         >>> import numpy as np
@@ -283,7 +284,8 @@ def delete_sample(name: str) -> Flow[scanner.SampleDeleteResult]:
 
 
 def sample_mesh() -> Flow[bytes]:
-    """The shape of the sample on the stage: binary STL in mm, in the sample's own frame.
+    """Return the shape of the sample on the stage: binary STL in mm, in the sample's own
+    frame.
 
     Raises:
         RpcError: there is no sample, or it has too many triangles to be sent.
@@ -366,7 +368,7 @@ def upload_scene(
     from flexdt.phantoms import Phantom
     from flexdt.phantoms.files.phantom_files import read_phantom_file
 
-    # A scene file is read here, as the meshes that it names lie beside it; what is sent is whole.
+    # A scene file is read here, as its mesh files are on this machine; the upload is complete.
     phantom = source if isinstance(source, Phantom) else read_phantom_file(Path(source))
     if name is None:
         name = source.name if isinstance(source, Phantom) else Path(source).stem
@@ -433,7 +435,7 @@ def projection(
     tube: Mapping[str, object] | None = None,
     camera: Mapping[str, object] | None = None,
 ) -> Flow[Projection]:
-    """An X-ray image at the current pose, or as it would be at another.
+    """Take an X-ray image at the current pose, or predict the one at another.
 
     Where `positions`, `tube` or `camera` is given nothing moves: the image is predicted, from the
     geometry of `geometry`, without noise.
@@ -459,7 +461,7 @@ def projection(
 
 
 def ray(column: float, row: float) -> Flow[dict[str, float]]:
-    """Path lengths through materials on the way to a pixel, in the geometry of `geometry`.
+    """Compute the path lengths through materials on the way to a pixel, by `geometry`.
 
     Args:
         column, row: of the image of this moment.
@@ -479,7 +481,8 @@ def ray(column: float, row: float) -> Flow[dict[str, float]]:
 
 
 def geometry() -> Flow[s.GeometryResult]:
-    """cone_vec, detector shape and pixel pitch: nominal plus the correction in force.
+    """Return cone_vec, detector shape and pixel pitch: nominal plus the correction in
+    force.
 
     Example:
         >>> len(twin.geometry().cone_vec)
@@ -630,7 +633,7 @@ def submit_trajectory(
 
 
 def jobs() -> Flow[scans.JobListResult]:
-    """All jobs, oldest first.
+    """List all jobs, oldest first.
 
     Example:
         >>> all(job.frames_done <= job.frames_total for job in twin.jobs().jobs)
@@ -640,12 +643,12 @@ def jobs() -> Flow[scans.JobListResult]:
 
 
 def _name_of(job: Job | None) -> str | None:
-    """The job's name; None is the current or last one."""
+    """Return the job's name; None is the current or last one."""
     return job.job if isinstance(job, scans.SubmitResult | s.JobStatus) else job
 
 
 def job_status(job: Job | None = None) -> Flow[s.JobStatus]:
-    """Progress of a job; `job` defaults to the current or last one.
+    """Return the progress of a job; `job` defaults to the current or last one.
 
     Example:
         >>> job = twin.submit_trajectory([{"rot_obj": 0.0}] * 20, 9000.0, speed_up=1.0).job
@@ -707,7 +710,7 @@ def step_job(job: Job | None = None) -> Flow[s.JobStatus]:
 
 
 def abort_job(job: Job | None = None, reason: str | None = None) -> Flow[s.JobStatus]:
-    """End a job; its data set stays, marked incomplete, and says the reason.
+    """End a job; its data set stays, marked incomplete, with the reason.
 
     Example:
         >>> job = twin.submit_trajectory([{"rot_obj": 0.0}] * 20, 9000.0, speed_up=1.0).job
@@ -780,7 +783,7 @@ def wait_job(
 def datasets(
     search: str = "", *, start: int = 0, count: int = 50
 ) -> Flow[corrections.DatasetListResult]:
-    """Data sets of the data directory, the newest first.
+    """List data sets of the data directory, the newest first.
 
     Args:
         search: words; each occurs in the name, the sample, a setting or the state.
@@ -800,7 +803,8 @@ def datasets(
 def dataset(
     name: str, points: int = 400, *, measure: bool = False, script: bool = False
 ) -> Flow[corrections.DatasetResult]:
-    """A data set: its settings, and poses and times of at most `points` of its images.
+    """Return a data set: its settings, and poses and times of at most `points` of its
+    images.
 
     Args:
         name: of its folder.
@@ -825,7 +829,7 @@ def dataset(
 def dataset_frame(
     name: str, index: int, kind: Kind = "counts", binning: int = 1
 ) -> Flow[tuple[npt.NDArray[np.generic], corrections.DatasetFrameResult]]:
-    """An image of a data set.
+    """Read an image of a data set.
 
     Args:
         name: of the data set's folder.
@@ -879,7 +883,7 @@ def apply_calibration(
 
 
 def calibration(name: str | None = None) -> Flow[s.Correction | None]:
-    """The correction in force, or the one called `name`.
+    """Return the correction in force, or the one called `name`.
 
     Example:
         >>> twin.calibration() is None  # none is in force
@@ -889,7 +893,7 @@ def calibration(name: str | None = None) -> Flow[s.Correction | None]:
 
 
 def calibrations() -> Flow[corrections.CorrectionListResult]:
-    """All corrections, oldest first.
+    """List all corrections, oldest first.
 
     Example:
         >>> twin.calibrations().current is None
@@ -899,7 +903,7 @@ def calibrations() -> Flow[corrections.CorrectionListResult]:
 
 
 def revert_calibration() -> Flow[corrections.CorrectionResult]:
-    """Go back to the correction before.
+    """Replace the correction in force by the one before it.
 
     Example:
         >>> twin.apply_calibration({"det_roll": 0.2}, "second").correction.name
@@ -1002,7 +1006,7 @@ def align_dataset(
 
 
 def save_scene(name: str | None = None) -> Flow[dict[str, Any]]:
-    """The whole state as one versioned document.
+    """Save the complete state as one versioned document.
 
     Example:
         >>> sorted(twin.save_scene("mine"))[:3]
@@ -1012,7 +1016,7 @@ def save_scene(name: str | None = None) -> Flow[dict[str, Any]]:
 
 
 def load_scene(document: Mapping[str, Any]) -> Flow[s.State]:
-    """Restore what `save_scene` made.
+    """Load a state that `save_scene` returned.
 
     Example:
         >>> twin.load_scene(twin.save_scene()).safety.state
