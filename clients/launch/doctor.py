@@ -24,14 +24,15 @@ from flexdt.twin import kernel_threads
 
 Verdict = Literal["ok", "warning", "error"]
 WORST_ERROR: Final = 1e-5
-"""Of the largest value: what float32 kernels may differ from the closed form by."""
+"""Largest allowed deviation of the float32 kernels from the closed form, relative to
+its maximum."""
 LITTLE_ROOM: Final = 5 << 30
 SLOW_SYNC_S: Final = 0.05
 
 
 @dataclass(frozen=True)
 class CheckOutcome:
-    """What one check found; `advice` where something can be done."""
+    """Result of one check; `advice` where something can be done."""
 
     what: str
     verdict: Verdict
@@ -40,11 +41,15 @@ class CheckOutcome:
 
 
 def examine(data: Path, ports: Sequence[tuple[str, int]]) -> Iterator[CheckOutcome]:
-    """All checks, one after the other.
+    """Run all checks, one after the other; a check that fails is an error among the
+    results.
 
     Args:
         data: the data directory, which need not exist.
-        ports: what is to listen there, and the port.
+        ports: name of a server ("twin", for one) and the port it is to listen on.
+
+    Yields:
+        One result for each check.
     """
     checks: list[Callable[[], CheckOutcome]] = [python, packages, kernels, threads, memory, gpu]
     checks += [lambda what=what, port=port: listening(what, port) for what, port in ports]  # type: ignore[misc]
@@ -57,13 +62,13 @@ def examine(data: Path, ports: Sequence[tuple[str, int]]) -> Iterator[CheckOutco
 
 
 def python() -> CheckOutcome:
-    """The interpreter."""
+    """Report the interpreter, the platform and flexdt's version."""
     found = f"{platform.python_implementation()} {platform.python_version()}, {platform.system()}"
     return CheckOutcome("python", "ok", f"{found} {platform.machine()}, flexdt {version('flexdt')}")
 
 
 def packages() -> CheckOutcome:
-    """What flexdt says it needs, extras apart."""
+    """Check that all required packages of flexdt are installed; extras are left out."""
     have, lack = [], []
     for name in needed():
         try:
@@ -85,7 +90,13 @@ def needed() -> tuple[str, ...]:
 
 
 def kernels() -> CheckOutcome:
-    """Compile and run: the shadow of a sphere in parallel to its closed form."""
+    """Compile and run the projector, and compare the shadow of a sphere with its closed
+    form.
+
+    Returns:
+        An error where the largest deviation exceeds `WORST_ERROR`; time of the first use
+        as well.
+    """
     import numpy as np
 
     from flexdt.twin.projection import project_scene
@@ -112,7 +123,8 @@ def kernels() -> CheckOutcome:
 
 
 def threads() -> CheckOutcome:
-    """Cores, numba's threads, their layer, and how they wait for each other."""
+    """Check the number of numba threads against the cores; report layer and waiting
+    policy."""
     import numba
 
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
@@ -126,14 +138,14 @@ def threads() -> CheckOutcome:
 
 
 def memory() -> CheckOutcome:
-    """What the projector may fill."""
+    """Check the memory of the machine, half of which the projector may fill."""
     total = memory_bytes()
     found = f"{total / 2**30:.1f} GiB; the projector holds volumes up to half of it"
     return CheckOutcome("memory", "ok" if total > 3 << 30 else "warning", found)
 
 
 def gpu() -> CheckOutcome:
-    """A CUDA device is an option, so its absence is no fault."""
+    """Report the CUDA device; its absence is no fault, only its failure is a warning."""
     from flexdt.twin.projection.gpu import availability
 
     found = availability()
@@ -142,7 +154,12 @@ def gpu() -> CheckOutcome:
 
 
 def listening(what: str, port: int) -> CheckOutcome:
-    """Whether a server may listen, or one of ours does already."""
+    """Check that a port is free for a server, or find the twin that listens there.
+
+    Args:
+        what: name of the server; "twin" is greeted where the port is in use.
+        port: on the loopback.
+    """
     name = f"port {port}"
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -160,7 +177,12 @@ def listening(what: str, port: int) -> CheckOutcome:
 
 
 def disk(data: Path) -> CheckOutcome:
-    """Whether data sets can be written: room, rights, speed of a flush."""
+    """Check that data sets can be written: free space, rights, time to flush 1 MiB.
+
+    Args:
+        data: the data directory; a temporary file is written there, or in its nearest
+            parent.
+    """
     folder = nearest_there(data)
     try:
         with tempfile.NamedTemporaryFile(dir=folder) as file:
@@ -183,7 +205,7 @@ def disk(data: Path) -> CheckOutcome:
 
 
 def _greeting(port: int) -> str:
-    """What a twin on `port` says of itself; "" if none answers."""
+    """Greet the twin on `port` and return its name and protocol; "" if none answers."""
     from flexdt.clients.client.client import TwinClient
     from flexdt.protocol import Code, RpcError
 

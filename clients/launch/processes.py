@@ -77,6 +77,12 @@ class Servers:
         return self._process.pid
 
     def __enter__(self) -> Servers:
+        """Start the processes under `flexdt.runtime.child` and wait for their `ready`
+        line.
+
+        Raises:
+            ServersError: they did not start; carries the end of their log.
+        """
         self._log_path.parent.mkdir(parents=True, exist_ok=True)
         self._log = self._log_path.open("ab")
         self._process = subprocess.Popen(
@@ -97,7 +103,11 @@ class Servers:
         self.stop()
 
     def stop(self) -> int | None:
-        """Stop everything and wait for it; returns the supervisor's exit code."""
+        """Stop all processes, wait for them and close the log.
+
+        Returns:
+            The supervisor's exit code; None if it was not running.
+        """
         process, self._process = self._process, None
         if process is None:
             return None
@@ -115,7 +125,7 @@ class Servers:
         return process.returncode
 
     def log_tail(self, lines: int = 5) -> Sequence[str]:
-        """The last lines that the processes wrote to standard error."""
+        """Read the last lines of the processes' standard error."""
         try:
             text = self._log_path.read_text(encoding="utf-8", errors="replace")
         except OSError:

@@ -17,11 +17,15 @@ from flexdt.library.failure import CommandError
 RANGES: Final[Mapping[str, float]] = {
     "dO_x": 1.0, "dO_y": 1.0, "dO_z": 2.0, "alpha": 5.0, "tau_x": 0.5, "tau_z": 0.5,
 }  # fmt: skip
-"""Parameter -> largest absolute value drawn [mm, deg]: what a careful operator may be off by."""
+"""Parameter -> largest absolute value drawn [mm, deg]: errors of a careful operator."""
 
 
 def draw() -> dict[str, float]:
-    """A misalignment nobody knows, in edge units, to four decimals."""
+    """Draw a misalignment from the operating system's entropy.
+
+    Returns:
+        Parameter -> value [mm, deg] of an edge, to four decimals, within `RANGES`.
+    """
     entropy = random.SystemRandom()
     return {name: round(entropy.uniform(-most, most), 4) for name, most in RANGES.items()}
 
@@ -34,6 +38,12 @@ def write(truth: Mapping[str, float], path: Path) -> None:
 
 def read(path: Path) -> dict[str, float]:
     """Read a truth file.
+
+    Args:
+        path: of a TOML file, parameter = value.
+
+    Returns:
+        Parameter -> value [mm, deg].
 
     Raises:
         CommandError: not TOML, an unknown parameter, or a value that is not a number.

@@ -39,7 +39,17 @@ COMPILING = "its first start on a machine compiles the kernels, some ten seconds
 
 
 def services(options: UpSettings) -> tuple[Service, ...]:
-    """In starting order: the twin needs the projector's address, the viewer the twin's."""
+    """List the services in starting order: projector, twin and, if chosen, viewer and
+    gateway.
+
+    The twin needs the projector's address, viewer and gateway the twin's.
+
+    Args:
+        options: of `flexdt up`; each service gets those it knows.
+
+    Returns:
+        Services whose command lines are made from the addresses known by then.
+    """
     viewer_limits = limit_names(ViewerLimits())
     for_viewer = [x for x in options.limit if x.partition("=")[0] in viewer_limits]
     for_twin = [x for x in options.limit if x not in for_viewer]
@@ -52,7 +62,8 @@ def services(options: UpSettings) -> tuple[Service, ...]:
     def twin(known: Addresses) -> Sequence[str]:
         own = {"port": port_of("twin", options.port, known), "projector": known["projector"],
                "projector_port": None, "limit": for_twin}  # fmt: skip
-        # Started again it goes on from where it was, whatever the first one was told.
+        # A restarted twin continues from its stored state, even if the first start was
+        # `fresh`.
         again = {"fresh": False} if "twin" in known else {}
         return ("flexdt.server.twin.main", *words(shared(options, TwinSettings) | own | again))
 
@@ -75,7 +86,7 @@ def services(options: UpSettings) -> tuple[Service, ...]:
 
 
 def port_of(name: str, asked: int, known: Addresses) -> int:
-    """The port of a service: the one it had before, else the one asked for."""
+    """Return the port of a service: the one it had before, else `asked`."""
     return known[name].port if name in known else asked
 
 
@@ -98,7 +109,8 @@ def port_problem(option: str, host: str, port: int) -> str | None:
 
 
 def ready_line(addresses: Addresses, *, secure: bool = False) -> str:
-    """The supervisor's `ready` line: the twin's address, and every process's by name."""
+    """Make the supervisor's `ready` line: the twin's address, and every process's by
+    name."""
     twin = addresses["twin"]
     document: dict[str, object] = {"ready": "up", "host": twin.host, "port": twin.port}
     for name, address in addresses.items():
@@ -112,7 +124,14 @@ def ready_line(addresses: Addresses, *, secure: bool = False) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run until stopped; returns the exit code."""
+    """Check ports and packages, then run the servers until stopped.
+
+    Args:
+        argv: command-line arguments; None for those of the process.
+
+    Returns:
+        The exit code.
+    """
     options = parse(UpSettings, argv)
     secure = options.tls_cert is not None
     wanted = [
@@ -124,7 +143,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if options.gateway_port:
         pair = (options.gateway_port, options.gateway_port + 1)
         wanted += [("--gateway-port", LOOPBACK, port) for port in pair]
-    # Before anything starts: a server would say it once its kernels are compiled, and end all.
+    # Checked before any start: a server would find it only after compiling, and end all.
     missing = lacking("zmq", "pyzmq", "gateway") if options.gateway_port is not None else None
     if missing is not None:
         print(f"flexdt up: --gateway-port: {missing}", file=sys.stderr)
@@ -146,7 +165,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _say(line: str, stream: TextIO) -> None:
-    """Print a line; nobody need read it."""
+    """Print a line; a closed stream is ignored."""
     with contextlib.suppress(OSError):
         print(line, file=stream, flush=True)
 
