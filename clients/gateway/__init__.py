@@ -1,1 +1,2 @@
-"""The scanner software's own socket interface beside the twin's: a program written for it works."""
+"""The scanner software's own socket interface on top of the twin: its programs run
+unchanged."""

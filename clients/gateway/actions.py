@@ -1,7 +1,7 @@
-"""What the commands of the socket interface do to the twin: one short function for each type.
+"""Actions of the commands of the socket interface: one short function for each type.
 
-A function returns the text of ACK or raises `Refusal`; while it runs, it keeps `Progress.text` up
-to date for FDB. Events and sockets are the business of `event_server`.
+A function returns the text of ACK or raises `Refusal`; while it runs, it keeps
+`Progress.text` up to date for FDB. Events and sockets are the business of `event_server`.
 """
 
 from __future__ import annotations
@@ -36,10 +36,11 @@ from flexdt.twin.script import commands as c
 from flexdt.twin.script.grammar import bare_name, image_name
 
 ARMED_S: Final = 10.0
-"""Real seconds that a move with a trigger waits for its image sequence before it moves alone."""
+"""Time that a move with a trigger waits for its image sequence before it moves alone
+[real s]."""
 JOB_POLL_S: Final = 0.1
 READY_S: Final = 900.0
-"""Twin seconds that X-rays may take to be ready."""
+"""Time limit for the X-rays to be ready [twin s]."""
 
 Action = Callable[[ConnectedTwin, Any, CommandProgress], Awaitable[str]]
 
@@ -77,7 +78,7 @@ async def write_settings(
 def setting(
     method: str, params: Callable[[Any], dict[str, object]], reply: Callable[[Any], str]
 ) -> Action:
-    """A command that only sets something.
+    """Make the action of a command that only sets a value.
 
     Args:
         method: of the twin.
@@ -139,6 +140,14 @@ async def save_image(twin: ConnectedTwin, command: c.SaveImage, progress: Comman
 async def move(twin: ConnectedTwin, command: c.MoveAbsolute, progress: CommandProgress) -> str:
     """Move to a position and wait for arrival.
 
+    Args:
+        twin: state and requests.
+        command: axis, target [mm, deg] and, if any, trigger position.
+        progress: its text is the position under way.
+
+    Returns:
+        The motor's reply, see `ConnectedTwin.motor_text`.
+
     With a trigger position, the move waits for an image sequence and is then a part of its job.
     """
     if command.trigger is None:
@@ -158,6 +167,20 @@ async def move(twin: ConnectedTwin, command: c.MoveAbsolute, progress: CommandPr
 
 
 async def _go(twin: ConnectedTwin, axis: str, target: float, progress: CommandProgress) -> str:
+    """Move an axis, report its position while it moves, and check that it arrived.
+
+    Args:
+        twin: state and requests.
+        axis: name of the motor or virtual axis.
+        target: [mm, deg]; beyond a limit it is clamped where the machine does so.
+        progress: its text is the position under way.
+
+    Returns:
+        The motor's reply, see `ConnectedTwin.motor_text`.
+
+    Raises:
+        Refusal: the axis was stopped or sent elsewhere.
+    """
     await twin.ask("axes.move", {"targets": {axis: await _at_limit_switch(twin, axis, target)}})
     state = await twin.state()
     bound = state.axes[axis].target
@@ -175,7 +198,7 @@ async def _go(twin: ConnectedTwin, axis: str, target: float, progress: CommandPr
 
 
 async def _at_limit_switch(twin: ConnectedTwin, axis: str, target: float) -> float:
-    """The target of a line of a script: a limit, where that is beyond it and the machine clamps."""
+    """Clamp a target beyond a limit to the limit, where the machine does so."""
     machine = twin.machine
     if machine is None or not machine.has(axis):
         return target
@@ -190,7 +213,7 @@ async def _at_limit_switch(twin: ConnectedTwin, axis: str, target: float) -> flo
 
 
 def rate_setting(what: Rate, digits: int) -> Action:
-    """A command that sets an axis's speed or acceleration, of moves to come."""
+    """Make the action that sets an axis's speed or acceleration for later moves."""
 
     async def send(twin: ConnectedTwin, command: Any, progress: CommandProgress) -> str:
         axis, machine = command.component, twin.machine
@@ -224,6 +247,9 @@ async def question(twin: ConnectedTwin, command: Question, progress: CommandProg
 async def sequence(twin: ConnectedTwin, command: c.TakeSequence, progress: CommandProgress) -> str:
     """Take an image sequence as a job of the twin, at rest or during the armed move.
 
+    Returns:
+        Text of ACK. The armed move ends with the job: with its reply, or with its error.
+
     The twin decides by its own clock when each image is taken, so the frames lie where the
     scanner's rule puts them, however slow the network is.
     """
@@ -245,7 +271,8 @@ async def sequence(twin: ConnectedTwin, command: c.TakeSequence, progress: Comma
             armed.ended.set_exception(
                 error if isinstance(error, Refusal) else Refusal("the sequence was cut short")
             )
-            # The sequence reports the same error, so nobody has to await the move's.
+            # The sequence reports the same error: mark the move's as retrieved, so asyncio
+            # logs nothing.
             armed.ended.exception()
         raise
     if armed is not None and armed.ended is not None:
@@ -254,7 +281,14 @@ async def sequence(twin: ConnectedTwin, command: c.TakeSequence, progress: Comma
 
 
 def _sequence_script(state: State, command: c.TakeSequence, armed: Armed | None) -> str:
-    """A script with every setting of the twin's state, then the move and the sequence."""
+    """Write the script of a sequence: every setting of the twin's state, the move, the
+    sequence.
+
+    Args:
+        state: of the twin; its camera, tube and rates are written as settings.
+        command: prefix and first number of the images.
+        armed: move with a trigger position; None takes the images at rest.
+    """
     camera = state.camera
     lines = [
         ("camera", "set mode", camera.mode, "", "ACK"),
@@ -276,7 +310,7 @@ def _sequence_script(state: State, command: c.TakeSequence, armed: Armed | None)
     prefix = bare_name(command.prefix)
     first = str(command.first)
     lines.append(("camera", "take and save image sequence", prefix, first, "ACK"))
-    if armed is not None:  # the same move once more, to wait for its end
+    if armed is not None:  # the same move again, to wait for its end
         lines.append((armed.axis, "move absolute", repr(armed.target), "", "ACK"))
     return "".join("\t".join((*line, "", "")) + "\r\n" for line in lines)
 
@@ -290,7 +324,20 @@ async def abort_script(twin: ConnectedTwin, command: AbortScript, progress: Comm
 
 
 async def _run(twin: ConnectedTwin, script: bytes, name: str, progress: CommandProgress) -> str:
-    """Submit a script and wait for the end of its job; returns the data set's folder."""
+    """Submit a script and wait for the end of its job.
+
+    Args:
+        twin: connection; its `job` is the running one meanwhile.
+        script: bytes of the script.
+        name: of the data set; a number is added where it is taken.
+        progress: its text is state and frames.
+
+    Returns:
+        The data set's folder.
+
+    Raises:
+        Refusal: another job runs, no name is free, or the job did not end as done.
+    """
     if twin.job is not None:
         raise Refusal(f"{twin.job} is running; wait for it or scanner abort script")
     for taken in (name, *(f"{name}-{number}" for number in range(2, 1000))):

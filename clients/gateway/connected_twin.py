@@ -31,9 +31,10 @@ from flexdt.twin.script.executed_log import MotorReply, motor_cluster
 _R = TypeVar("_R")
 MAX_SCRIPT: Final = 8 << 20
 LIVELY_S: Final = 0.1
-"""Real seconds between two requests for the state while something moves or a scan runs."""
+"""Interval between requests for the state while something moves or a scan runs [real
+s]."""
 POLL_S: Final = 0.05
-"""Real seconds between two requests for the state while a command runs."""
+"""Interval between requests for the state while a command runs [real s]."""
 
 
 @dataclass
@@ -61,11 +62,11 @@ class Armed:
 
 
 class ConnectedTwin:
-    """What the commands act on.
+    """The twin with the state that commands act on.
 
     Args:
         link: the connection to the twin.
-        root: the data directory for what the gateway saves.
+        root: the data directory for the gateway's own images.
         machine, profile: the twin's, where they are files.
     """
 
@@ -85,15 +86,16 @@ class ConnectedTwin:
         self.recording: Recording | None = None
         self.axes: tuple[str, ...] = ()
         self.sequence: bytes | None = None
-        """Script of the sequence that a client takes now: its command has been told already."""
+        """Script of the sequence that a client takes now; its command has been echoed
+        already."""
         self.lively = False
-        """Whether something moves or a scan runs, so that the state is asked for."""
+        """Whether something moves or a scan runs, so that the state is polled."""
         self.jobs: dict[str, JobStatus] = {}
-        """Jobs that have not ended, or whose end has not been told."""
+        """Jobs that have not ended, or whose end has not been sent."""
         self._news = asyncio.Event()
 
     def heard(self, topic: str, params: Mapping[str, object]) -> None:
-        """The twin has sent an event: something has changed."""
+        """Take an event of the twin: keep the status of a job, and wake `news`."""
         if topic == "job":
             status = JobStatus.model_validate(params["data"])
             if status.state not in FINAL_STATES or status.job in self.jobs:
@@ -101,7 +103,12 @@ class ConnectedTwin:
         self._news.set()
 
     def told_jobs(self, state: State) -> list[JobStatus]:
-        """The jobs of which something may have to be told, each as it is known last."""
+        """Return the newest status of each job whose progress is to be sent; drop ended
+        ones.
+
+        Args:
+            state: of the twin; its job is added.
+        """
         now = state.job
         if now is not None and self.jobs.get(now.job, now).state not in FINAL_STATES:
             self.jobs[now.job] = now
@@ -118,7 +125,8 @@ class ConnectedTwin:
         await asyncio.sleep(POLL_S)
 
     def script_of(self, job: JobStatus) -> bytes | None:
-        """The script of a job; None where it cannot be read, or is a client's own sequence."""
+        """Read the script of a job; None where it cannot be read, or is a client's own
+        sequence."""
         path = Path(job.dataset or "") / SCRIPT
         if not path.is_file() or path.stat().st_size > MAX_SCRIPT:
             return None
@@ -139,11 +147,12 @@ class ConnectedTwin:
             raise Refusal(f"the twin cannot be reached: {error}") from None
 
     async def run(self, flow: Flow[_R]) -> _R:
-        """The result of one of the client's methods (`twin_methods`); raises as `ask`."""
+        """Run one of the client's methods (`twin_methods`) and return its result;
+        raises as `ask`."""
         return await adrive(flow, lambda asked: self.ask(asked.method, asked.params))
 
     async def state(self) -> State:
-        """The twin's present state."""
+        """Get the twin's present state; updates `axes`."""
         state = await self.run(m.state())
         self.axes = tuple(state.axes)
         return state
@@ -159,7 +168,7 @@ class ConnectedTwin:
             state = await self.state()
 
     def record(self) -> Recording:
-        """The recording that images go to now."""
+        """Return the recording that images go to now; create it at the first use."""
         if self.recording is None:
             machine, profile = self._scanner()
             self.recording = Recording(
@@ -179,7 +188,7 @@ class ConnectedTwin:
         self.record().transcript += lines
 
     def motor_text(self, axis: str, at: AxisState) -> str:
-        """The reply to a completed move: a motor's cluster, a character a byte, as the scanner's.
+        """Format the reply to a completed move: a motor's cluster, one character a byte.
 
         A virtual axis, which has no motor, and a motor of a machine that the gateway does not know
         reply with their position.
@@ -212,7 +221,8 @@ class ConnectedTwin:
 
 
 def _one_line(error: RpcError) -> str:
-    """An error of the twin as one line, with the problems of a script and their line numbers."""
+    """Format an error of the twin as one line, with the problems of a script and their
+    lines."""
     data = error.data
     if isinstance(data, Mapping):
         data = data.get("problems")

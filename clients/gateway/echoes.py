@@ -1,7 +1,8 @@
-"""What others command, told as the scanner tells it: its clients hear every command.
+"""Commands of others as the scanner's own events: every client sees every command.
 
-Moves and settings over the twin's wire, from the viewer for one, are seen as changes of its state;
-a script's commands are told line by line as its job comes to them. Time is an argument.
+Moves and settings over the twin's wire, from the viewer for one, are derived from changes
+of its state; a script's commands are sent line by line as its job reaches them. Time is
+an argument.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ class ScriptLine:
 
 
 def script_lines(script: bytes) -> tuple[ScriptLine, ...]:
-    """The commands of a script, one for each step of its plan.
+    """Read the commands of a script, one for each step of its plan.
 
     Example:
         >>> script_lines(b"tube\\txrayon\\t\\t\\tACK\\t\\t")
@@ -47,7 +48,8 @@ def script_lines(script: bytes) -> tuple[ScriptLine, ...]:
 
 
 def _texts(row: CodeLine) -> tuple[str, ...]:
-    """Component, command and two arguments; in the space-padded form a command has many words."""
+    """Split a row into component, command and two arguments, also in the space-padded
+    form."""
     texts = [f.text for f in (row.columns if row.columns is not None else row.words())]
     matched = None if row.columns is not None else grammar.match(texts[0], texts[1:])
     if matched is not None:
@@ -59,7 +61,7 @@ def _texts(row: CodeLine) -> tuple[str, ...]:
 
 @dataclass
 class Echoes:
-    """What has been told so far.
+    """State and script lines sent so far, to derive the next events from.
 
     Args:
         reply: text of a completed move, from its axis and state.
@@ -75,15 +77,17 @@ class Echoes:
     _line: Exchange | None = None
 
     def adopt(self, state: State, component: str) -> None:
-        """A component is as a command of the interface itself has left it."""
+        """Store a component's state after a command of the interface, so that it is
+        not echoed."""
         self._known |= {k: v for k, v in told(state).items() if k[0] == component}
 
     def see(self, state: State, own: Collection[str], now: float) -> Iterator[AcquilaEvent]:
-        """Events for what has changed.
+        """Yield the events for changes of the state.
 
         Args:
             state: of the twin.
-            own: components on which commands of the interface run, which have told themselves.
+            own: components with running commands of the interface, which send their own
+                events.
             now: real time [s].
         """
         new = told(state)
@@ -115,11 +119,12 @@ class Echoes:
         state: State,
         now: float,
     ) -> Iterator[AcquilaEvent]:
-        """Events for the lines that a job has come to.
+        """Yield the events for the lines that a job has reached.
 
         Args:
             status: of the job.
-            script: a job's text, asked for once; None if it is not to be told or cannot be read.
+            script: returns a job's text, called once; None if it is not to be sent or
+                cannot be read.
             state: of the twin.
             now: real time [s].
         """
@@ -182,7 +187,11 @@ class Echoes:
 
 
 def told(state: State) -> Mapping[Key, str]:
-    """What commands could have set, in the scanner's words and decimals."""
+    """Return all values that commands can set, in the scanner's words and decimals.
+
+    Returns:
+        (component, command) -> argument; `xrays` has the command itself.
+    """
     tube, camera = state.tube, state.camera
     made = {
         ("tube", "xrays"): "xrayon" if tube.on else "xrayoff",

@@ -43,17 +43,18 @@ from flexdt.twin.script.grammar import own_name
 
 FAILED: Final = "internal error; the gateway's log has the details"
 FOREIGN_S: Final = 2.0
-"""Real seconds within which a component elsewhere must reply RCV."""
+"""Time limit for the RCV of a component elsewhere [real s]."""
 LINGER_MS: Final = 200
 PAIR_TRIES: Final = 50
 MAX_LOGGED: Final = 100
-"""How many rejected events, and how many failed commands, are logged."""
+"""Largest number of rejected events, and of failed commands, that are logged."""
 MAX_RUNNING: Final = 256
-"""Commands that may run at once; twice as many if they stop or abort something."""
+"""Largest number of running commands; twice as many if they stop or abort something."""
 MAX_HELD: Final = 64
-"""Events that ZeroMQ holds for each sender until they are read, of at most 1 MiB each."""
+"""Largest number of unread events that ZeroMQ holds for each sender, of at most 1 MiB
+each."""
 HANDSHAKE_MS: Final = 3000
-"""A connection that has not introduced itself by then is closed: where 167 come a second, 500 are
+"""Time limit for the handshake of a connection [ms]: where 167 come a second, 500 are
 open. ZeroMQ's own is 30 s."""
 PAUSE_S: Final = 0.1
 ALWAYS: Final = frozenset({"stop", "abort script"})
@@ -63,7 +64,7 @@ class Gateway:
     """The socket interface of one twin.
 
     Args:
-        twin: what commands act on.
+        twin: target of the commands.
         host: loopback address to listen on.
         port: for outgoing events; 0 is any free port.
         inbound: port for incoming events; None is the next one.
@@ -129,6 +130,15 @@ class Gateway:
             self._send(event.answer(ReplyType.ERR, FAILED))
 
     def _take(self, event: AcquilaEvent) -> None:
+        """Start a command, or forward a reply.
+
+        A command gets a number if it is anonymous; an echo of a running one is dropped,
+        and one too many is answered by ERR. Subscribers see the command as well as its
+        replies.
+
+        Args:
+            event: from a client.
+        """
         if not event.is_command:
             self._forward(event)
             return
@@ -149,7 +159,8 @@ class Gateway:
         self._start(self._guarded(work, event), key)
 
     async def _echo(self) -> None:
-        """Tell clients what others command: over the twin's wire, from the viewer, by a script."""
+        """Send clients the commands of others: over the twin's wire, from the viewer,
+        by a script."""
         clock = asyncio.get_running_loop().time
         while True:
             await self.twin.news()
@@ -177,6 +188,13 @@ class Gateway:
             self._send(event.answer(ReplyType.ERR, FAILED))
 
     async def _execute(self, event: AcquilaEvent, kind: ComponentType) -> None:
+        """Run a command of the scanner with its replies: RCV, FDB while it runs, ACK or
+        ERR.
+
+        Args:
+            event: the command.
+            kind: type of its component.
+        """
         clock = asyncio.get_running_loop().time
         exchange = Exchange(event, kind, clock())
         self._send(exchange.received(clock()))
@@ -227,7 +245,11 @@ class Gateway:
             raise
 
     async def _foreign(self, event: AcquilaEvent) -> None:
-        """Wait for some subscriber to answer a command that is not for the scanner."""
+        """Wait for another subscriber to answer a command that is not for the scanner.
+
+        Args:
+            event: the command; ERR is sent where no answer comes within `FOREIGN_S`.
+        """
         key = event.key
         heard = self._awaited.setdefault(key, asyncio.Event())
         try:
@@ -244,7 +266,7 @@ class Gateway:
             self._awaited.pop(key, None)
 
     def _forward(self, event: AcquilaEvent) -> None:
-        """Forward the reply of a component elsewhere, unless it is an echo of ours."""
+        """Send on the reply of a component elsewhere, unless it is an echo of ours."""
         text = format_event(event)
         if hash(text) in self._recent:
             return
@@ -254,7 +276,8 @@ class Gateway:
         self._send(event)
 
     async def _adopt(self, component: str) -> None:
-        """What a command of a client has done is known, and nobody else's doing."""
+        """Store the state after a client's command, so that it is not echoed; end the
+        component's busy mark."""
         try:
             if self.twin.link.connected:
                 self._echoes.adopt(await self.twin.state(), component)
@@ -279,7 +302,7 @@ class Gateway:
     def _send(self, event: AcquilaEvent) -> None:
         text = format_event(event)
         self._recent.append(hash(text))
-        # A PUB socket never blocks: it drops what a slow subscriber does not take.
+        # A PUB socket never blocks: it drops messages that a slow subscriber does not take.
         self._out.send(text.encode("utf-8", "replace"))
 
     def _reject(self, why: str) -> None:
@@ -291,7 +314,7 @@ class Gateway:
         self._send(AcquilaEvent("gateway", "receive", reply=reply, reply_type=ReplyType.ERR))
 
     def _log_failure(self, command: str) -> None:
-        """Log the exception being handled, unless very many have been logged."""
+        """Write the exception being handled to the log, up to `MAX_LOGGED` times."""
         self._failed += 1
         if self._failed <= MAX_LOGGED:
             log("gateway command failed", logging.ERROR, error=True, command=command)
@@ -309,7 +332,15 @@ class Gateway:
     def _bind(
         self, port: int, inbound: int | None
     ) -> tuple[zmq.asyncio.Socket, zmq.asyncio.Socket, int, int]:
-        """Bind PUB and SUB; if any free port will do, find two neighbouring ones."""
+        """Bind PUB and SUB; if any free port will do, find two neighbouring ones.
+
+        Args:
+            port: of PUB; 0 is any free port.
+            inbound: port of SUB; None is the next one.
+
+        Returns:
+            PUB, SUB and their ports.
+        """
         for left in reversed(range(PAIR_TRIES if port == 0 and inbound is None else 1)):
             out = self._socket(zmq.PUB)
             out.bind(bind_endpoint(self.host, port))
@@ -353,18 +384,18 @@ def check_loopback(host: str) -> None:
 
 
 def bind_endpoint(host: str, port: int) -> str:
-    """ZeroMQ's name of an address; port 0 is any free port."""
+    """Format an address as ZeroMQ's endpoint; port 0 is any free port."""
     place = f"[{host}]" if ":" in host else ("127.0.0.1" if host == "localhost" else host)
     return f"tcp://{place}:{port or '*'}"
 
 
 def bound_port(socket: zmq.asyncio.Socket) -> int:
-    """The port that a socket is bound to."""
+    """Return the port that a socket is bound to."""
     return int(socket.getsockopt_string(zmq.LAST_ENDPOINT).rpartition(":")[2])
 
 
 def transcript_line(event: AcquilaEvent, command: c.Command) -> str | None:
-    """The command as a line of a script; None if it cannot occur in one."""
+    """Write the command as a line of a script; None if it cannot occur in one."""
     if type(command).__module__ != c.__name__:
         return None
     wait = "POS" if isinstance(command, c.MoveAbsolute) and command.trigger is not None else "ACK"

@@ -33,7 +33,17 @@ EVENTS_HZ = 20.0
 
 
 async def run(options: GatewaySettings) -> int:
-    """Serve until SIGTERM or SIGINT; returns the exit code."""
+    """Serve until SIGTERM or SIGINT.
+
+    Args:
+        options: addresses, token, certificate, folders and files of the process.
+
+    Returns:
+        The exit code.
+
+    Raises:
+        OSError: a port is taken.
+    """
     from zmq import ZMQError
 
     from flexdt.clients.gateway.event_server import Gateway

@@ -1,9 +1,10 @@
-"""What a session over the socket interface saves: one folder per output path, as on the scanner.
+"""Images of a session over the socket interface: one folder per output path, as on the
+scanner.
 
-Images appear under the bare names of the commands' paths, never partly written; beside them are the
-two settings texts, `flexdt.json` with the pose of every image, and `script.txt` with the commands
-so far. Frames of a sequence come from the data set that the twin made of it. Nothing is written
-outside the data directory or over an existing file.
+Images appear under the bare names of the commands' paths, never partly written. With them
+are the two settings texts, `flexdt.json` with the pose of every image, and `script.txt`
+with the commands so far. Frames of a sequence come from the data set that the twin made
+of it. Nothing is written outside the data directory or over an existing file.
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ class Recording:
         self._folder: Directory | None = None
         self._closed = False
         self._turn = threading.Lock()
-        """Images are saved in threads, while another output path may be set."""
+        """Lock: images are saved in threads, while another output path may be set."""
 
     @property
     def folder(self) -> Path | None:
@@ -83,7 +84,8 @@ class Recording:
         return None if self._folder is None else self._folder.path
 
     def suggest(self, path: str) -> None:
-        """Without an output path, name the folder after the folder in a file's path."""
+        """Name the folder after the folder in a file's path, where no output path is
+        set."""
         parts = [part for part in re.split(r"[\\/]", path)[:-1] if bare_name(part)]
         if self._folder is None and self.name == UNNAMED and parts:
             self.name = bare_name(parts[-1])
@@ -147,6 +149,15 @@ class Recording:
                 self._folder = None
 
     def _files(self, names: Sequence[str]) -> Directory:
+        """Open the recording's folder, made at the first use, and check that names are
+        free.
+
+        Args:
+            names: of files to be written.
+
+        Raises:
+            DatasetError: the recording is closed, or a file of that name exists.
+        """
         if self._closed:
             raise DatasetError(
                 "another output path has been set meanwhile; the image is still in the camera",
@@ -186,6 +197,11 @@ class Recording:
             put_texts(self._folder, record)
 
     def _record(self) -> ScanRecord | None:
+        """Build the record of the images so far: blocks, settings, times and correction.
+
+        Returns:
+            The record; None where machine or profile is unknown.
+        """
         if self._machine is None or self._profile is None:
             return None
         last = self._states[-1]
@@ -218,7 +234,7 @@ class Recording:
 
 
 def camera_of(state: State) -> CameraSettings:
-    """The camera's settings in a state."""
+    """Return the camera's settings in a state."""
     c = state.camera
     left, top, right, bottom = c.roi
     roi = Roi(left, top, right, bottom)
@@ -226,13 +242,15 @@ def camera_of(state: State) -> CameraSettings:
 
 
 def kind_of_file(file: str) -> FrameKind:
-    """The kind of an image, from its file name; a preview counts as a projection."""
+    """Determine the kind of an image from its file name; a preview counts as a
+    projection."""
     kind = kind_of(file)
     return "projection" if kind == "preview" else kind
 
 
 def _same_file(name: str, source: Directory, files: Directory, *, linked: bool) -> None:
-    """Link an image, which never changes, into the folder; copy it if the disk has no links."""
+    """Copy an image, which never changes, into the folder: as a link if the disk has
+    links."""
     with suppress(OSError, NotImplementedError):
         if linked:
             source.link(name, name, files)
@@ -250,7 +268,8 @@ def _correction(state: State) -> NamedCorrection | None:
 
 
 def _blocks(frames: Sequence[FrameEntry], start: float) -> list[FrameBlock]:
-    """Frames of a document, grouped into runs of equal settings; times count from `start` [s]."""
+    """Split a document's frames into runs of equal settings; times count from `start`
+    [s]."""
 
     def settings(f: FrameEntry) -> tuple[object, ...]:
         return (f.kind, f.mode, f.roi, f.exposure_ms, f.averages, f.xrays_on)

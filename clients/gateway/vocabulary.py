@@ -55,13 +55,15 @@ _EXTRA: Final[Mapping[str, Mapping[str, Extra]]] = {
         "status_position_get": lambda event: Question(path=("axes", event.component, "position")),
     },
 }
-"""Commands beside the script's vocabulary; only status_XReady_get is in any public text."""
+"""Commands in addition to the script's vocabulary; only status_XReady_get is in any
+public text."""
 
 _FIXED: Final[dict[str, ComponentType]] = {"tube": "tube", "camera": "camera", "scanner": "other"}
 
 
 def component_type(component: str, axes: Collection[str]) -> ComponentType | None:
-    """The type of `component`, or None if neither scanner nor twin has one of that name."""
+    """Return the type of `component`, or None if neither scanner nor twin has one of
+    that name."""
     name = grammar.own_name(component, axes)
     if name in _FIXED:
         return _FIXED[name]
@@ -71,13 +73,13 @@ def component_type(component: str, axes: Collection[str]) -> ComponentType | Non
 
 
 def known_commands(component: str) -> tuple[str, ...]:
-    """Every command of `component`."""
+    """List every command of `component`."""
     own = _EXTRA.get(component.lower(), _EXTRA[""])
     return (*grammar.vocabulary(component), *own)
 
 
 def read_command(event: AcquilaEvent, axes: Collection[str]) -> c.Command:
-    """The command of an event.
+    """Read the command of an event.
 
     Args:
         event: from a client.
@@ -121,5 +123,5 @@ def _extra(event: AcquilaEvent, name: str) -> c.Command:
 
 
 def shown(text: str) -> str:
-    """Text in quotes, short enough for a message."""
+    """Return text in quotes, short enough for a message."""
     return repr(grammar.shorten(text, MAX_SHOWN))
