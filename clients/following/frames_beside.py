@@ -1,8 +1,9 @@
-"""The newest real frame of a folder beside the twin's radiograph of the mirrored machine.
+"""The newest real frame of a folder with the twin's radiograph of the mirrored machine.
 
-The machine's positions and camera are those when the frame appeared; the profile's offsets and the
-phantom on the stage are the session's. The distance of the two images comes from the peak of their
-cross-correlation, whitened (phase correlation; Kuglin and Hines 1975).
+The machine's positions and camera are those when the frame appeared; the profile's
+offsets and the phantom on the stage are the session's. The distance of the two images
+comes from the peak of their cross-correlation, whitened (phase correlation; Kuglin and
+Hines 1975).
 """
 
 from __future__ import annotations
@@ -28,9 +29,10 @@ from flexdt.twin.machine.kinematics import motor_poses
 
 
 def newest_frame(folder: Path) -> tuple[Path, float] | None:
-    """The TIFF that was written last, and when; None if there is none.
+    """Find the TIFF that was written last; dark and flat images are skipped.
 
-    Darks and flats are none.
+    Returns:
+        Its path and time of writing [s since the epoch]; None if there is none.
     """
     found = []
     for path in folder.glob("*.tif*"):
@@ -47,8 +49,8 @@ class FramesBeside:
 
     Args:
         follower: its machine and profile.
-        phantom: what stands on the stage.
-        out: where to.
+        phantom: on the stage.
+        out: folder to write to.
     """
 
     follower: Follower
@@ -56,12 +58,16 @@ class FramesBeside:
     out: Path
 
     def write(self, path: Path, mirror: Mirror, age_s: float) -> dict[str, object]:
-        """One frame beside its radiograph.
+        """Write one frame with its radiograph, side by side.
 
         Args:
             path: of the frame.
             mirror: the machine when it appeared.
-            age_s: of the frame.
+            age_s: of the frame [s].
+
+        Returns:
+            The content of `beside.json`: file, age, white level and shift of the two
+            images, for one.
 
         Raises:
             TwinError: no readable image, or of another shape than the camera's.
@@ -88,9 +94,13 @@ class FramesBeside:
 
 
 def line_integrals(path: Path, shape: tuple[int, int]) -> tuple[Float32Array, str]:
-    """A frame's line integrals (rows, cols), and what they take for white.
+    """Convert a frame to line integrals (rows, cols).
 
-    With a dark and a flat beside it these are used; else white is a percentile of the frame.
+    Dark and flat images of its folder are used; without them white is a percentile of the
+    frame.
+
+    Returns:
+        The line integrals, and a description of the white level.
 
     Raises:
         TwinError: no readable image, or of another shape.
@@ -107,7 +117,7 @@ def line_integrals(path: Path, shape: tuple[int, int]) -> tuple[Float32Array, st
 
 
 def shift(virtual: Float32Array, real: Float32Array) -> tuple[float, float]:
-    """By how much the real image lies aside of the virtual one [px], (columns, rows).
+    """Measure the shift of the real image against the virtual one [px], (columns, rows).
 
     Example:
         >>> image = np.zeros((32, 48), np.float32)

@@ -1,4 +1,5 @@
-"""From the bytes of the scanner's interface to what a follower hears: no socket, no clock."""
+"""From the bytes of the scanner's interface to a follower's messages: no socket, no
+clock."""
 
 from __future__ import annotations
 
@@ -13,14 +14,15 @@ from flexdt.twin.script.grammar import own_name
 
 
 def heard(data: bytes, axes: Collection[str], stamp: str, late_s: float = 0.0) -> Heard:
-    """One message.
+    """Read one message.
 
     Args:
-        data: as it came; UTF-8, or one byte for each character where a cluster makes it none. What
-            stands before the object, such as a topic, is left out.
+        data: bytes of the message; UTF-8, or one byte for each character where a cluster
+            is not
+            UTF-8. A prefix of the object, such as a topic, is left out.
         axes: motors and virtual axes of the machine.
         stamp: time of day, hh:mm:ss.mmm.
-        late_s: by how much earlier it may have come than it was read [s].
+        late_s: uncertainty of the time: it may have come so much earlier [s].
 
     Raises:
         AcquilaError: the bytes are no event.
@@ -39,7 +41,8 @@ def heard(data: bytes, axes: Collection[str], stamp: str, late_s: float = 0.0) -
 
 
 def _read(event: AcquilaEvent, axes: Collection[str]) -> tuple[c.Command | None, str]:
-    """The typed command, and what a question asks for; neither of what the scripts do not know."""
+    """Read the typed command, or the name of a question; None and "" for any other
+    command."""
     try:
         command = read_command(event, axes)
     except Refusal:

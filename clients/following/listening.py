@@ -1,10 +1,10 @@
-"""The one socket of `flexdt follow`: it hears a scanner and cannot send.
+"""The one socket of `flexdt follow`: it listens to a scanner and cannot send.
 
-A thread of its own does nothing but read the socket and its clock: a message has come between the
-last moment at which there was none and the moment at which it was read, and time passes only as far
-as was listened to. So a busy computer makes times less certain, but no machine slow or fast. The
-socket is a SUB socket, which cannot send a message; ZeroMQ's own heartbeats tell within a second
-that a cable is out.
+A thread of its own does nothing but read the socket and its clock: a message has come
+between the last moment at which there was none and the moment at which it was read, and
+time passes only as far as was listened to. So a busy computer makes times less certain,
+but no machine slow or fast. The socket is a SUB socket, which cannot send a message;
+ZeroMQ's own heartbeats detect within a second that a cable is out.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ LOST: Final = "the scanner has ended the connection, or does not answer"
 POLL_S: Final = 0.02
 HEARTBEAT_MS: Final = 200
 SILENT_MS: Final = 500
-"""A scanner whose ZeroMQ does not answer a heartbeat for so long is not there."""
+"""Longest time without an answer to a heartbeat before the scanner counts as lost
+[ms]."""
 RETRY_MS: Final = 100
 MOST_RETRY_MS: Final = 1000
 MAX_HELD: Final = 10_000
@@ -35,7 +36,7 @@ _ADDRESS: Final = re.compile(r"(?:tcp://)?(\[[0-9a-fA-F:.]+\]|[^\s:/\[\]]+)(?::(
 
 
 def endpoint(address: str) -> str:
-    """ZeroMQ's name of `tcp://HOST[:PORT]`.
+    """Convert `tcp://HOST[:PORT]` to ZeroMQ's endpoint.
 
     Raises:
         ValueError: it is none.
@@ -62,8 +63,10 @@ async def listen(
 
     Args:
         address: see `endpoint`.
-        message: called with every message, when it was read, and how much earlier it may have come.
-        passed: called ten times a second with the time up to which all messages have been told.
+        message: called with every message, the time of reading, and how much earlier it
+            may have come.
+        passed: called ten times a second with the time up to which all messages were
+            passed on.
         link: called with whether there is a connection, and why not, when that changes.
         clock: monotonic [s].
 
@@ -73,6 +76,13 @@ async def listen(
     tell, ended = asyncio.get_running_loop().call_soon_threadsafe, threading.Event()
 
     def read(socket: zmq.Socket[bytes], monitor: zmq.Socket[bytes]) -> None:
+        """Read messages and changes of the connection, and pass them to the event loop,
+        until `ended`.
+
+        Args:
+            socket: of messages.
+            monitor: of the connection's events.
+        """
         told = clock()
         while not ended.is_set():
             none_before = clock()  # whatever is found from here on was not there before
@@ -91,6 +101,7 @@ async def listen(
                     tell(message, data, now, now - none_before)
 
     def work() -> None:
+        """Open the SUB socket and its monitor, read until the end, and close both."""
         with zmq.Context() as context, context.socket(zmq.SUB) as socket:
             for option, value in (
                 (zmq.LINGER, 0), (zmq.RCVHWM, MAX_HELD), (zmq.MAXMSGSIZE, MAX_BYTES),

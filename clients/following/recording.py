@@ -35,7 +35,7 @@ class Recorded:
 
 
 def time_of_day(seconds: float, digits: int = 3) -> str:
-    """hh:mm:ss.mmm of a time since a midnight.
+    """Format a time since a midnight as hh:mm:ss.mmm.
 
     Example:
         >>> time_of_day(86400.0 + 3723.5)
@@ -48,13 +48,13 @@ def time_of_day(seconds: float, digits: int = 3) -> str:
 
 
 def format_recorded(message: Recorded) -> bytes:
-    """A message as a recording holds it."""
+    """Encode a message with its time, as a recording holds it."""
     head = f"[{time_of_day(message.at_s, 6)} {message.late_s:.6f}] "
     return head.encode() + message.data + b"\n"
 
 
 def read_recording(data: bytes) -> Iterator[Recorded]:
-    """The messages of a recording; times go on after midnight.
+    """Yield the messages of a recording; times go on after midnight.
 
     Example:
         >>> recording = b"[23:59:59] {}\\n[00:00:01.5 0.002] {}\\n"

@@ -1,8 +1,10 @@
-"""A session of `flexdt follow`: messages in; alarms, a record and a mirror in the twin out.
+"""A session of `flexdt follow`: messages in; alarms, a record and a mirror in the twin
+out.
 
-It decides nothing: `flexdt.twin.following` says what a message changes. Time is this machine's
-monotonic clock when a message came, or that of a recording, which takes the same way. With a folder
-of frames, the last real one is written beside the twin's radiograph (`frames_beside`).
+It decides nothing: `flexdt.twin.following` determines the effect of a message. Time is
+this machine's monotonic clock when a message came, or that of a recording, which takes
+the same way. With a folder of frames, the last real one is written with the twin's
+radiograph (`frames_beside`).
 """
 
 from __future__ import annotations
@@ -39,13 +41,14 @@ Tell = Callable[[Alarm], None]
 
 @dataclass
 class FollowSession:
-    """What one `flexdt follow` knows.
+    """State of one `flexdt follow`.
 
     Args:
         follower: compares.
         tell: called with each new alarm.
         record: gets the raw messages; None for none.
-        changed: called whenever the mirror has changed, a message came or time has passed.
+        changed: called whenever the mirror has changed, a message came or time has
+            passed.
         clock: monotonic [s].
         executed: called with the lines of the executed script.
 
@@ -73,7 +76,10 @@ class FollowSession:
         self._midnight = self.clock() - (now - midnight).total_seconds()
 
     def message(self, data: bytes, at: float | None = None, late_s: float = 0.0) -> None:
-        """One message has come, between `late_s` before `at` and `at`, or now."""
+        """Take one message, which came between `late_s` before `at` and `at`, or now.
+
+        Messages that are no events are counted in `unread`.
+        """
         at = self.clock() if at is None else at
         self._keep(data, at, late_s)
         try:
@@ -87,17 +93,17 @@ class FollowSession:
             self.executed(line)
 
     def link(self, connected: bool, why: str) -> None:
-        """The connection has come up or gone down."""
+        """Take a change of the connection: `connected`, else `why` it was lost."""
         now = self.clock()
         self._keep(UP if connected else LINK + why.encode(), now, 0.0)
         self._take(self.follower.linked(self.mirror, connected, now, why))
 
     def tick(self, now: float) -> None:
-        """Time has passed up to `now`, and every message until then was told."""
+        """Let time pass up to `now`; all earlier messages have been passed on."""
         self._take(self.follower.tick(self.mirror, now))
 
     def time_of_day(self, at: float) -> str:
-        """hh:mm:ss.mmm of a time of the clock."""
+        """Format a time of the clock as hh:mm:ss.mmm."""
         return time_of_day(at - self._midnight)
 
     def _keep(self, data: bytes, at: float, late_s: float) -> None:
@@ -125,11 +131,11 @@ class FollowSession:
             tasks.create_task(self._look_ahead())
 
     def replay(self, recording: bytes, ahead: bool = True) -> None:
-        """Hear a recording as if it came now; the clock is the recording's.
+        """Replay a recording as if it came now; the clock is the recording's.
 
         Args:
             recording: see `flexdt.clients.following.recording`.
-            ahead: whether what is under way, and the rest of the script, are checked as well.
+            ahead: whether current moves and the rest of the script are checked as well.
         """
         now = self._midnight = 0.0
         self.clock = lambda: now
@@ -148,7 +154,12 @@ class FollowSession:
                 self._take(self.follower.told(self.mirror, self.follower.ahead(self.mirror, now)))
 
     async def show_frames(self, folder: Path, beside: FramesBeside) -> None:
-        """Write each new frame of a folder beside its radiograph, until cancelled."""
+        """Write each new frame of a folder with its radiograph, until cancelled.
+
+        Args:
+            folder: of the scanner's frames; a frame counts once it is no longer written.
+            beside: writer of image pairs; its errors become alarms.
+        """
         done = seen = newest_frame(folder)
         while True:
             await asyncio.sleep(FRAMES_S)
@@ -165,7 +176,8 @@ class FollowSession:
                 self._take(self.mirror.alarmed(alarm))
 
     async def _look_ahead(self) -> None:
-        """Check what is under way and the rest of the script, again whenever either changes."""
+        """Check current moves and the rest of the script, again whenever either
+        changes."""
         while True:
             await asyncio.sleep(TICK_S)
             if self._is_new():
@@ -173,14 +185,15 @@ class FollowSession:
                 self._take(self.follower.told(self.mirror, found))
 
     def _is_new(self) -> bool:
-        """Whether what lies ahead has changed since this was asked last."""
+        """Determine whether targets or the next line have changed since the last call."""
         key = (self.mirror.next_line, tuple(a.target for a in self.mirror.axes.values()))
         before, self._looked = self._looked, key if self.mirror.heard_s is not None else None
         return self._looked not in (None, before)
 
 
 def executed_script(recording: bytes, machine: Machine) -> bytes:
-    """The executed script in a recording of raw messages, as the scanner would have written it."""
+    """Return the executed script in a recording of raw messages, as the scanner would
+    write it."""
     lines: list[bytes] = []
     follower = Follower(machine, Profile(name=ZERO, machine=machine.name, source="no offsets"))
     FollowSession(follower, executed=lines.append).replay(recording, ahead=False)
