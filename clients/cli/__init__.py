@@ -13,7 +13,7 @@ __all__ = ["main"]
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Entry point of the command line; leaves with the exit codes of docs/command-line.md."""
+    """Run the command line; leaves with the exit codes of docs/command-line.md."""
     from flexdt.clients.cli.command_tree import run
 
     sys.exit(run(sys.argv[1:] if argv is None else list(argv)))

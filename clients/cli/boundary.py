@@ -43,7 +43,14 @@ LIMIT_CODES: Final = ("limit", "collision")
 
 
 def describe(error: Exception) -> tuple[tuple[str, ...], int]:
-    """What to print for an error, and the exit code it means."""
+    """Return the lines to print for an error, and its exit code.
+
+    Args:
+        error: of any kind; one that is not expected is called a defect of flexdt.
+
+    Returns:
+        Lines that begin with `flexdt:`, and the exit code.
+    """
     from flexdt.protocol.rpc_errors import RpcError
     from flexdt.twin import errors as twin
 
@@ -97,7 +104,8 @@ def _usage(error: Exception) -> tuple[str, ...]:
 
 
 def _wire_error(error: RpcError) -> tuple[str, ...]:
-    """An error reply of a server: `code`, `message` and `data` of JSON-RPC."""
+    """Return the lines of a server's error reply: `code`, `message` and `data` of
+    JSON-RPC."""
     lines = [error.message]
     if isinstance(error.data, Mapping):  # the message states the first parameter's problem
         found = error.data.get("problems", ())
@@ -106,7 +114,7 @@ def _wire_error(error: RpcError) -> tuple[str, ...]:
 
 
 def wire_code(error: RpcError) -> int:
-    """Exit code of an error reply."""
+    """Determine the exit code of an error reply."""
     if error.code == -32005 and isinstance(error.data, Sequence):
         wrong = [p for p in error.data if p.get("severity", "error") == "error"]
         return verdict(str(p.get("code")) for p in wrong) or INVALID
@@ -114,7 +122,8 @@ def wire_code(error: RpcError) -> int:
 
 
 def verdict(errors: Iterable[str]) -> int:
-    """Exit code of a script with errors of these codes: invalid wins over collision and limit."""
+    """Determine the exit code of a script with errors of these codes: invalid wins
+    over collision and limit."""
     codes = set(errors)
     if codes - set(LIMIT_CODES):
         return INVALID
@@ -122,13 +131,14 @@ def verdict(errors: Iterable[str]) -> int:
 
 
 def _asked(file: object) -> str:
-    """The file that the user named, where the error names its temporary file."""
+    """Return the file that the user named, where the error names its temporary file."""
     plain = re.sub(r"\.part$", "", str(file))
     return re.sub(r"(^|.*/)\.([^/]+)\.part\.[^./]+$", r"\1\2", plain)
 
 
 def positions(data: object, file: str = "") -> list[str]:
-    """Lines `file:line:column: message` for the problems in an error's data, if it has any."""
+    """List `file:line:column: message` for the problems in an error's data, if it has
+    any."""
     if isinstance(data, Mapping):
         data = data.get("problems", data.get("errors"))
     if not isinstance(data, Sequence) or isinstance(data, str):

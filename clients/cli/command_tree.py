@@ -1,6 +1,7 @@
 """The command tree: each name with the function that it runs.
 
-Command modules import what they need inside their functions, so building the tree is cheap.
+Command modules import their dependencies inside their functions, so building the tree is
+cheap.
 
 `run` runs one command line: the command tree, the error boundary, an exit code.
 """
@@ -54,7 +55,7 @@ COMMANDS: Final[Mapping[str, Callable[..., object]]] = {
     )
     for name in names.split()
 }
-"""Name -> what it runs."""
+"""Name -> function of a command."""
 GROUPS: Final[Mapping[str, tuple[str, Mapping[str, Callable[..., object]]]]] = {
     "script": ("Scan scripts.", {"new": scripts.new}),
     "job": ("Jobs: scripts and trajectories being run.", jobs.JOB_COMMANDS),
@@ -77,7 +78,7 @@ GROUPS: Final[Mapping[str, tuple[str, Mapping[str, Callable[..., object]]]]] = {
         },
     ),
 }
-"""Name -> what its commands are about, and the commands."""
+"""Name -> subject of a group's commands, and the commands."""
 GROUP: Final = "flexdt.commands"
 """Entry points that add other distributions' commands."""
 KNOWN: Final[Mapping[str, str]] = {
@@ -112,11 +113,11 @@ OWN: Final[Mapping[str, str]] = {
 }  # fmt: skip
 """Options of `flexdt` itself that may also follow the command's name, as help pages show them."""
 WITH_VALUE: Final = ("--server", "--token-file")
-"""Those of `OWN` that a value follows."""
+"""Options of `OWN` that a value follows."""
 
 
 def own_first(words: Sequence[str], flags: Collection[str]) -> tuple[list[str], list[str]]:
-    """The words of these options of `OWN`, and the other words."""
+    """Split words into these options of `OWN`, with their values, and the other words."""
     first, rest = list[str](), list[str]()
     more = iter(words)
     for word in more:
@@ -162,11 +163,12 @@ class InSections(TyperGroup):
 
 
 def build(words: Sequence[str] | None = None) -> typer.Typer:
-    """The whole command line.
+    """Build the command line with all its commands.
 
     Args:
-        words: of the command line, after the program's name: of other distributions' commands the
-            one that is named is loaded, the others are listed. None loads all.
+        words: of the command line, after the program's name. Of other distributions'
+            commands
+            only the named one is loaded, the others are listed. None loads all.
     """
     app = typer.Typer(
         name="flexdt",
@@ -211,7 +213,8 @@ def build(words: Sequence[str] | None = None) -> typer.Typer:
 
 
 def found(name: str) -> Callable[..., Any] | None:
-    """The function of a command, a word or two, that an installed distribution offers."""
+    """Load the function of a command, a word or two, that an installed distribution
+    offers."""
     from flexdt.library.extras import offered
 
     function: Callable[..., Any] | None = offered(name.replace(" ", "."), GROUP)
@@ -219,7 +222,7 @@ def found(name: str) -> Callable[..., Any] | None:
 
 
 def listed(name: str) -> Callable[..., None]:
-    """A command for the help page; where it is run, its distribution is missing."""
+    """Make the placeholder of a command of an extension that is not installed."""
 
     def command(words: list[str] | None = argument(None, "...")) -> None:
         from flexdt.library.extras import extension
@@ -233,7 +236,14 @@ def listed(name: str) -> Callable[..., None]:
 def _add_others(
     app: typer.Typer, groups: Mapping[str, typer.Typer], words: Sequence[str] | None
 ) -> None:
-    """Add other distributions' commands, which take no name of ours."""
+    """Add other distributions' commands, which take no name of ours.
+
+    Args:
+        app: the command line.
+        groups: its groups of commands, by name.
+        words: of the command line; only the named command is loaded, None loads all known
+            ones.
+    """
     if words is None:
         asked = [*KNOWN]
     else:
@@ -290,7 +300,14 @@ def run(argv: Sequence[str]) -> int:
 
 
 def _run(argv: Sequence[str]) -> int:
-    """`run`, but for Ctrl-C."""
+    """Run one command line as `run`; Ctrl-C is not handled here.
+
+    Args:
+        argv: words after the program's name.
+
+    Returns:
+        The exit code.
+    """
     printable()
     if argv and argv[0] in RETIRED:
         note(
@@ -298,7 +315,7 @@ def _run(argv: Sequence[str]) -> int:
             "ordinary folder: `tar -cf ARCHIVE.tar DIR` copies it, `tar -xf ARCHIVE.tar` unpacks it"
         )
         return USAGE
-    completing = COMPLETING in os.environ  # a shell asks what could come next
+    completing = COMPLETING in os.environ  # a shell requests completions
     command = get_command(build(None if completing else argv))
     if completing:
         command.main(list(argv), prog_name="flexdt")
@@ -311,7 +328,7 @@ def _run(argv: Sequence[str]) -> int:
         raise
     except typer.Exit as leave:
         return leave.exit_code
-    except BrokenPipeError:  # the help page's; results are `say`'s
+    except BrokenPipeError:  # a closed pipe at the help page; `say` handles that of results
         hush()
         return DONE
     except Exception as error:
@@ -324,7 +341,8 @@ def _run(argv: Sequence[str]) -> int:
 
 
 def _spread(argv: Sequence[str]) -> list[str]:
-    """`--roi 'L T R B'` (or with commas) as the four words that `--roi L T R B` has."""
+    """Split `--roi 'L T R B'` (or with commas) into the four words that `--roi L T R
+    B` has."""
     out: list[str] = []
     for word in argv:
         whole = out[-1:] == ["--roi"]

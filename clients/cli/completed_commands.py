@@ -1,7 +1,9 @@
-"""Commands as typer takes them: with what `flexdt` itself was told, and their answers printed.
+"""Commands as typer takes them: with the options of `flexdt` itself, and their answers
+printed.
 
-`--json`, `--server` and `--token-file` are options of `flexdt` itself, which commands get as
-arguments: what yields answers `--json`, and a parameter `twin: Twin` connects to the server.
+`--json`, `--server` and `--token-file` are options of `flexdt` itself, which commands get
+as arguments: a generator's answers obey `--json`, and a parameter `twin: Twin` connects
+to the server.
 """
 
 from __future__ import annotations
@@ -19,15 +21,23 @@ from flexdt.runtime.files.writable import require_writable
 from flexdt.runtime.settings import described, has_parameters
 
 GIVEN: Final = ("context", "twin", "json")
-"""Parameters of commands that are no options of theirs."""
+"""Parameters of commands that are filled in, not options."""
 
 
 TALK: Final = ("--quiet", "-q", "--verbose", "-v")
-"""Options of `flexdt` that all of these commands heed."""
+"""Options of `flexdt` that all of these commands obey."""
 
 
 def completed(command: Callable[..., Any]) -> tuple[Callable[..., None], tuple[str, ...]]:
-    """A command as typer takes it, and the options of `flexdt` that it heeds."""
+    """Wrap a command for typer: fill its arguments from `flexdt`'s options, print its
+    answers.
+
+    Args:
+        command: function with `Args:` as help; a generator yields texts and a document.
+
+    Returns:
+        The wrapped command, and the options of `flexdt` that it obeys.
+    """
     own = inspect.signature(command, eval_str=True).parameters
     yields = inspect.isgeneratorfunction(inspect.unwrap(command))
     if not yields and "context" in own:  # it passes its words on
@@ -68,7 +78,7 @@ def completed(command: Callable[..., Any]) -> tuple[Callable[..., None], tuple[s
 
 
 def _with_choices(parameter: inspect.Parameter) -> inspect.Parameter:
-    """The parameter with the words that its option is among as its type."""
+    """Return the parameter with the allowed words of its option as its type."""
     among = getattr(parameter.default, "among", None)
     if among is None:
         return parameter

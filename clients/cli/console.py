@@ -28,11 +28,11 @@ _quiet = False
 
 
 def speak(quiet: bool, verbose: bool) -> None:
-    """Set how much is said on standard error beside warnings and errors.
+    """Set the amount of output on standard error in addition to warnings and errors.
 
     Args:
         quiet: no progress.
-        verbose: what takes time and how long it took, and what libraries log.
+        verbose: slow steps with their duration, and messages of libraries.
     """
     global _quiet
     _quiet = quiet
@@ -45,19 +45,20 @@ def speak(quiet: bool, verbose: bool) -> None:
 
 
 def printable() -> None:
-    """What the terminal's encoding cannot write comes out as an escape, not as an error."""
+    """Set the terminal's streams to write unknown characters as escapes, without an
+    error."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
 
 
 def hush() -> None:
-    """Discard further output: its reader has ended (`flexdt ... | head`)."""
+    """Drop further output: its reader has ended (`flexdt ... | head`)."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def say(text: str = "", end: str = "\n") -> None:
-    """A line of the result, to standard output."""
+    """Print a line of the result to standard output."""
     try:
         print(text, end=end, flush=True)
     except BrokenPipeError:
@@ -70,7 +71,7 @@ def note(text: str) -> None:
 
 
 def warn(texts: Iterable[str], about: object = None) -> None:
-    """Write warnings to standard error, each behind what it is about."""
+    """Write warnings to standard error, each after its subject."""
     for text in texts:
         note(f"warning: {text}" if about is None else f"{about}: warning: {text}")
 
@@ -81,7 +82,8 @@ def emit(document: object) -> None:
 
 
 def as_json(document: object) -> str:
-    """A document as JSON; numbers that are not finite become null, other things text."""
+    """Convert a document to JSON; numbers that are not finite become null, unknown
+    objects text."""
     from pydantic_core import to_jsonable_python
 
     def plain(value: Any) -> object:
@@ -92,7 +94,7 @@ def as_json(document: object) -> str:
 
 
 def table(rows: Iterable[Sequence[object]], header: Sequence[str] = ()) -> str:
-    """Text columns, padded; numbers are the caller's to format."""
+    """Format rows as padded text columns; numbers are formatted by the caller."""
     every = [[str(cell) for cell in row] for row in (header, *rows) if row]
     if not every:
         return ""
@@ -105,7 +107,7 @@ def table(rows: Iterable[Sequence[object]], header: Sequence[str] = ()) -> str:
 
 
 def duration(seconds: float) -> str:
-    """A time span for people: 3.2 s, 4 min 05 s, 2 h 03 min."""
+    """Format a time span for people: 3.2 s, 4 min 05 s, 2 h 03 min."""
     if not math.isfinite(seconds):
         return "unknown"
     if seconds < 60:
@@ -118,7 +120,7 @@ def duration(seconds: float) -> str:
 
 
 def size(count: float) -> str:
-    """A number of bytes for people: 1.2 GB."""
+    """Format a number of bytes for people: 1.2 GB."""
     for unit in ("B", "kB", "MB", "GB"):
         if abs(count) < 1000:
             return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
@@ -133,10 +135,10 @@ class ProgressBar:
     """A context manager; call `update` as often as you like.
 
     Args:
-        title: what is going on.
-        unit: what is counted, e.g. "frames".
+        title: of the work.
+        unit: of the count, e.g. "frames".
         clock: seconds, monotonic (an argument for tests).
-        terminal: draw a bar; None asks standard error.
+        terminal: draw a bar; None looks whether standard error is a terminal.
     """
 
     def __init__(
@@ -156,6 +158,8 @@ class ProgressBar:
         self._alone = ExitStack()
 
     def __enter__(self) -> ProgressBar:
+        """Start the bar on a terminal, else print the title; do nothing where output
+        is quiet."""
         if _quiet:
             return self
         if self._terminal:
@@ -174,7 +178,7 @@ class ProgressBar:
         return self
 
     def update(self, done: float, total: float | None, text: str | None = None) -> None:
-        """Report `done` of `total`; `text` replaces the title."""
+        """Show `done` of `total`; `text` replaces the title."""
         if self._bar is not None and self._task is not None:
             self._bar.update(
                 self._task, completed=done, total=total, description=text or self._title

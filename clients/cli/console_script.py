@@ -1,15 +1,19 @@
-"""The console script `flexdt`: Ctrl-C ends it within a second, whatever it does.
+"""The console script `flexdt`: Ctrl-C ends it within a second at any time.
 
-Installed as the module `flexdt_command` beside the package (`src/flexdt_command.py` is a link to
-this file): an import of any module of the package imports the package itself first.
+Installed as the module `flexdt_command` outside the package (`src/flexdt_command.py` is a
+link to this file): an import of any module of the package imports the package itself
+first.
 
 From the start of `main` on SIGINT ends the process with exit code 130 and one line:
 
-- while a module is imported, at once: libraries do not expect an exception there, and some swallow
+- while a module is imported, at once: libraries do not expect an exception there, and
+some swallow
   it;
-- where the main thread runs Python, as KeyboardInterrupt, which commands clean up after; at once
-  where nobody would get it, as in a finaliser;
-- where the main thread has been in compiled code for `STUCK_S` (a kernel, the compiler), at once.
+- where the main thread runs Python, as KeyboardInterrupt, which commands clean up after;
+at once
+  where no code would get it, as in a finaliser;
+- where the main thread has been in compiled code for `STUCK_S` (a kernel, the compiler),
+at once.
 """
 
 from __future__ import annotations
@@ -22,15 +26,15 @@ import sys
 INTERRUPTED = 130
 LINE = b"flexdt: interrupted\n"
 STUCK_S = 0.4
-"""From the signal's arrival to the end of a process whose main thread has not heard of it."""
+"""Time from the signal to the end of a process whose main thread has not reacted [s]."""
 IMPORTING = "<frozen importlib._bootstrap>"
 
 _heard = 0
-"""Signals that the main thread has heard of."""
+"""Number of signals that the main thread has handled."""
 
 
 def leave(*_: object) -> None:
-    """End the process now; what was printed stays."""
+    """End the process now; printed lines stay."""
     try:
         os.write(2, LINE)
     finally:
@@ -70,7 +74,7 @@ def _end_if_stuck(arrivals: int) -> None:
 
 
 def _not_lost(unraisable: object) -> None:
-    """End the process at a KeyboardInterrupt that nobody gets, as in a finaliser."""
+    """End the process at a KeyboardInterrupt that no code gets, as in a finaliser."""
     if unraisable.exc_type is KeyboardInterrupt:  # type: ignore[attr-defined]
         leave()
     sys.__unraisablehook__(unraisable)  # type: ignore[arg-type]

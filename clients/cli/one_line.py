@@ -10,5 +10,5 @@ class OneLine(argparse.ArgumentParser):
     """Reports a wrong option in one line, without the page of all options."""
 
     def error(self, message: str) -> NoReturn:
-        """Exit with code 2."""
+        """End the program with exit code 2 and one line."""
         self.exit(2, f"{self.prog}: {message}\n")

@@ -1,8 +1,8 @@
 """The words of options and arguments as values.
 
-Words of the command line that do not hold (AXIS=VALUE, lists, file names) become usage errors (exit
-code 2) that quote the word and state what is allowed. The twin, not this module, knows the names of
-the axes.
+Invalid words of the command line (AXIS=VALUE, lists, file names) become usage errors
+(exit code 2) that quote the word and state the allowed form. The twin, not this module,
+knows the names of the axes.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from flexdt.library.failure import CommandError
 
 
 def number(word: str, what: str) -> float:
-    """A finite number, negative ones and exponents included.
+    """Read a finite number, negative ones and exponents included.
 
     Raises:
         typer.BadParameter: not a finite number.
@@ -32,7 +32,7 @@ def number(word: str, what: str) -> float:
 
 
 def assignments(words: Iterable[str]) -> dict[str, float]:
-    """AXIS=VALUE words to axis -> value, in order.
+    """Read AXIS=VALUE words as axis -> value, in order.
 
     Raises:
         typer.BadParameter: a word of another form, or an axis given twice.
@@ -50,7 +50,7 @@ def assignments(words: Iterable[str]) -> dict[str, float]:
 
 
 def span(word: str, what: str) -> tuple[float, float]:
-    """LOWER:UPPER, or one number for both.
+    """Read LOWER:UPPER, or one number for both.
 
     Raises:
         typer.BadParameter: neither, or the lower is above the upper.
@@ -64,15 +64,15 @@ def span(word: str, what: str) -> tuple[float, float]:
 def numbers(
     word: str, what: str, form: str, *counts: int, by: str = ",", whole: bool = False
 ) -> list[float]:
-    """A list of finite numbers.
+    """Read a list of finite numbers.
 
     Args:
         word: from the command line.
-        what: is listed, for errors.
+        what: name of the list, for errors.
         form: of the list with an example, for errors: `X,Y,Z, e.g. 0,0,-5.5`.
-        counts: how many there may be.
-        by: what separates them.
-        whole: they are whole and above 0.
+        counts: allowed lengths.
+        by: separator.
+        whole: they are integers above 0.
 
     Raises:
         typer.BadParameter: another count, or a part that is no such number.
@@ -84,13 +84,13 @@ def numbers(
 
 
 def triple(word: str, what: str, form: str) -> tuple[float, float, float]:
-    """Three of `numbers`."""
+    """Read three of `numbers`."""
     x, y, z = numbers(word, what, form, 3)
     return x, y, z
 
 
 def position(word: str) -> tuple[float, float]:
-    """SOD[:LATERAL] to (SOD, lateral) [mm]; lateral is 0 if left out.
+    """Read SOD[:LATERAL] as (SOD, lateral) [mm]; lateral is 0 if left out.
 
     Raises:
         typer.BadParameter: not numbers.
@@ -103,7 +103,7 @@ def position(word: str) -> tuple[float, float]:
 
 
 def names(word: str) -> tuple[str, ...]:
-    """A comma-separated list of names, blanks dropped."""
+    """Read a comma-separated list of names, blanks dropped."""
     return tuple(part.strip() for part in word.split(",") if part.strip())
 
 

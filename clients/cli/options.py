@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from flexdt.clients.client.client import TwinClient
 
 Answer = Iterator[object]
-"""What most commands yield: texts, which are lines for people, and one thing that is no text, which
-is the document of `--json`."""
+"""Answer of most commands: texts, which are lines for people, and one object that is
+no text, the document of `--json`."""
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
 Verbose = Annotated[
     bool | None,
@@ -98,7 +98,8 @@ def option(
     written: bool = False,
     **details: Any,
 ) -> Any:
-    """The default of a command's parameter that the command line offers as an option.
+    """Make the default of a command's parameter that the command line offers as an
+    option.
 
     Args:
         default: where the option is left out; `...` for one that must be given.
@@ -122,7 +123,7 @@ def option(
 def argument(
     default: object, metavar: str, help: str = "", proposes: Proposer | None = None
 ) -> Any:
-    """Declare a command's parameter that is a word of its own.
+    """Make the default of a command's parameter that is a word of its own.
 
     Args:
         default: where the word is left out; `...` if it must be given.

@@ -1,8 +1,8 @@
-"""The settings file: what commands and processes leave out comes from it.
+"""The settings file: defaults of commands and processes.
 
-Environment variables override the file, options of commands override both. The file is TOML:
-`$XDG_CONFIG_HOME/flexdt/config.toml`, `~/.config/flexdt/config.toml` where that variable is not
-set, or the one that FLEXDT_CONFIG names.
+Environment variables override the file, options of commands override both. The file is
+TOML: `$XDG_CONFIG_HOME/flexdt/config.toml`, `~/.config/flexdt/config.toml` where that
+variable is not set, or the one that FLEXDT_CONFIG names.
 
     server = "scanner-room:55000"     # FLEXDT_SERVER
     token_file = "~/.flexdt-token"    # FLEXDT_TOKEN_FILE; or token = "...", FLEXDT_TOKEN
@@ -47,7 +47,7 @@ S = TypeVar("S", bound=Settings)
 
 PREFIX: Final = "FLEXDT_"
 PATHS: Final = ("FILE", "DIR")
-"""What values are that may begin with ~."""
+"""Kinds of values that may begin with ~."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,17 +79,17 @@ TABLES: Final[Mapping[str, type[Settings]]] = {
         ReconstructSettings, ScriptNewSettings,
     )
 }  # fmt: skip
-"""Tables of the file, and what their keys are."""
+"""Tables of the file, and the settings of their keys."""
 ELSEWHERE: Final[Mapping[str, str]] = {"doctor": "up"}
 """Commands that read the table of another one."""
 KEYS: Final = {
     f.name: f.metadata["details"]["metavar"] for f in fields(Configuration) if f.metadata
 }
-"""Keys of the file that stand in no table -> what they are; `FLEXDT_` and a key is a variable."""
+"""Keys outside the file's tables -> their meaning; `FLEXDT_` and a key is a variable."""
 
 
 def config_file(environ: Mapping[str, str]) -> Path:
-    """Where the configuration file is, or would be."""
+    """Return the path of the configuration file, which need not exist."""
     named = environ.get(f"{PREFIX}CONFIG")
     if named:
         return Path(named).expanduser()
@@ -98,7 +98,7 @@ def config_file(environ: Mapping[str, str]) -> Path:
 
 
 def configuration(environ: Mapping[str, str] | None = None) -> Configuration:
-    """The defaults in force.
+    """Read the defaults in force.
 
     Args:
         environ: the environment; this process's if left out.
@@ -110,7 +110,7 @@ def configuration(environ: Mapping[str, str] | None = None) -> Configuration:
     path = config_file(env)
     found = _of_file(path, required=bool(env.get(f"{PREFIX}CONFIG")))
     own = {key: env[name] for key in KEYS if (name := f"{PREFIX}{key.upper()}") in env}
-    if {"token", "token_file"} & set(own):  # one stands for both
+    if {"token", "token_file"} & set(own):  # each replaces the other
         found.pop("token", None)
         found.pop("token_file", None)
     found |= own
@@ -126,6 +126,18 @@ def configuration(environ: Mapping[str, str] | None = None) -> Configuration:
 
 
 def _of_file(path: Path, *, required: bool) -> dict[str, Any]:
+    """Read the configuration file and check its keys and plain values.
+
+    Args:
+        path: of the TOML file.
+        required: whether a missing file is an error; else it is empty.
+
+    Returns:
+        Key -> text, and table -> its keys.
+
+    Raises:
+        CommandError: unreadable, not TOML, an unknown key, or a value that is no text.
+    """
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -152,7 +164,8 @@ def _of_file(path: Path, *, required: bool) -> dict[str, Any]:
 def _require_known(
     where: str, given: Iterable[str], known: Collection[str], tables: Sequence[str] = ()
 ) -> None:
-    """Check the keys of a table, or those that stand in none, beside which there are tables."""
+    """Check the keys of a table, or those outside all tables; the error lists keys and
+    tables."""
     for key in given:
         if key not in known:
             allowed = ", ".join((*known, *tables))
@@ -160,7 +173,8 @@ def _require_known(
 
 
 def settings_of(kind: type[S], more: Sequence[str] = ()) -> S | None:
-    """A table of the file as settings; None if `more` asked for the help, which is shown.
+    """Read a table of the file as settings; None if `more` requests the help, which is
+    shown.
 
     Args:
         kind: of a process or command.
@@ -190,14 +204,16 @@ def settings_of(kind: type[S], more: Sequence[str] = ()) -> S | None:
 
 
 def chosen(kind: type[S]) -> S:
-    """The settings of a command, from its table of the file; errors as `settings_of`."""
+    """Read the settings of a command from its table of the file; errors as
+    `settings_of`."""
     found = settings_of(kind)
     assert found is not None
     return found
 
 
 def home_of(command: str, flag: str) -> str | None:
-    """Where the file says what `flag` of a command said once; None if it has no such key."""
+    """Return the place in the file of a former option `flag`; None if the file has no
+    such key."""
     name = "_".join(command.split()[1:])
     table, key = ELSEWHERE.get(name, name), flag.lstrip("-").replace("-", "_")
     if table not in TABLES or key not in {f.name for f in fields(TABLES[table])}:

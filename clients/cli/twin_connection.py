@@ -16,12 +16,12 @@ DEFAULT_SERVER: Final = str(Address(LOOPBACK, TWIN_PORT))
 
 
 def connect(server: str | None = None, token_file: str | None = None) -> TwinClient:
-    """A client for a twin, to be used as a context manager.
+    """Connect to a twin and return the client, to be used as a context manager.
 
-    What is None is taken from the user's configuration, see `configuration`.
+    Arguments that are None come from the user's configuration, see `configuration`.
 
     Args:
-        server: HOST:PORT, see `server_address`; 127.0.0.1:55000 if nothing says otherwise.
+        server: HOST:PORT, see `server_address`; 127.0.0.1:55000 if nothing is configured.
         token_file: file whose first line is the session's token; shows none by default.
 
     Raises:
@@ -45,7 +45,8 @@ def connect(server: str | None = None, token_file: str | None = None) -> TwinCli
 
 
 def server_address(word: str) -> tuple[str, int]:
-    """HOST:PORT, HOST, :PORT or [IPV6]:PORT to (host, port); the default port is 55000.
+    """Read HOST:PORT, HOST, :PORT or [IPV6]:PORT as (host, port); the default port is
+    55000.
 
     Raises:
         typer.BadParameter: no such form, or a port outside 1 to 65535.

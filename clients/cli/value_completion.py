@@ -13,45 +13,46 @@ AXIS_VALUE = "="
 
 
 def machine_names(typed: str) -> list[str]:
-    """Propose machines that ship with flexdt."""
+    """List machines that ship with flexdt, as completions."""
     from flexdt.twin.machine.description import builtin_machines
 
     return _beginning(typed, builtin_machines())
 
 
 def profile_names(typed: str) -> list[str]:
-    """Propose profiles of zero offsets that ship with flexdt."""
+    """List profiles of zero offsets that ship with flexdt, as completions."""
     from flexdt.twin.machine.description import builtin_profiles
 
     return _beginning(typed, builtin_profiles())
 
 
 def sample_names(typed: str) -> list[str]:
-    """Propose phantoms that ship with flexdt."""
+    """List phantoms that ship with flexdt, as completions."""
     from flexdt.phantoms import phantom_names
 
     return _beginning(typed, phantom_names())
 
 
 def material_names(typed: str) -> list[str]:
-    """Propose materials of the table."""
+    """List materials of the table, as completions."""
     from flexdt.phantoms.materials import materials
 
     return _beginning(typed, materials())
 
 
 def axis_names(typed: str) -> list[str]:
-    """Propose axes of the configured machine."""
+    """List axes of the configured machine, as completions."""
     return _beginning(typed, _axes())
 
 
 def axis_values(typed: str) -> list[str]:
-    """Propose axes of the configured machine, each with the sign before its value."""
+    """List axes of the configured machine, each with the sign before its value, as
+    completions."""
     return _beginning(typed, (name + AXIS_VALUE for name in _axes()))
 
 
 def mode_names(typed: str) -> list[str]:
-    """Propose camera modes of the configured machine."""
+    """List camera modes of the configured machine, as completions."""
     from flexdt.library.machines import machine
 
     return _beginning(typed, machine(None).detector.mode_names)
@@ -65,5 +66,5 @@ def _axes() -> list[str]:
 
 
 def _beginning(typed: str, names: Iterable[str]) -> list[str]:
-    """List the names that begin with what was typed; upper and lower case do not matter."""
+    """List the names that begin with the typed letters, in upper or lower case."""
     return [name for name in names if name.lower().startswith(typed.lower())]

@@ -1,1 +1,1 @@
-"""The commands of the command line; `command_tree` says which module has which."""
+"""The commands of the command line; `command_tree` assigns names to their functions."""

@@ -130,12 +130,12 @@ def calibrate(
 
 
 def _assigned(given: list[str] | None) -> dict[str, float]:
-    """P=VALUE,... of an option that may be given several times."""
+    """Read P=VALUE,... of an option that may be given several times."""
     return option_values.assignments(word for one in given or () for word in one.split(","))
 
 
 def _named(phantom: str | None) -> str:
-    """The phantom that was named; none is a usage error that lists those that ship."""
+    """Return the named phantom; none is a usage error that lists those that ship."""
     if phantom is None:
         from flexdt.phantoms import phantom_names
 
@@ -149,7 +149,22 @@ def _given(
     folders: list[Path], frames: Path | None, markers: Path | None, geometries: list[Path],
     known: Given,
 ) -> list[DataSet]:  # fmt: skip
-    """The data sets, anybody's frames, or the geometry of markers without images."""
+    """Load the data sets, any scanner's frames, or the geometry of markers without
+    images.
+
+    Args:
+        folders: data sets; none needs `frames` or `markers`.
+        frames: folder of any scanner's TIFFs.
+        markers: file of markers seen in the images.
+        geometries: files, one for each data set; exactly one without data sets.
+        known: detector shape and pitch that the files lack.
+
+    Returns:
+        The data sets.
+
+    Raises:
+        typer.BadParameter: options that do not go together.
+    """
     if folders:
         if frames is not None:
             raise typer.BadParameter("--frames and a data set; give one")
@@ -171,7 +186,7 @@ def _given(
 
 
 def _opened(folders: list[Path], geometries: list[Path] | None) -> list[DataSet]:
-    """The data sets, each with its own geometry or the one of a file."""
+    """Load the data sets, each with its own geometry or the one of a file."""
     from flexdt.library.datasets.exchange import load_geometry, with_geometry
     from flexdt.library.reading.folders import load_dataset
 
@@ -266,7 +281,8 @@ def compare(
 
 
 def _require_answer(twin: Twin) -> None:
-    """A twin that does not answer is reported before the work, not after it."""
+    """Connect to the twin: report before the work, not after it, that it does not
+    answer."""
     with twin():
         pass
 
@@ -291,7 +307,15 @@ def push_correction(client: TwinClient, correction: NamedCorrection, source: str
 
 
 def show(document: Mapping[str, Any]) -> Iterator[str]:
-    """A calibration's document for people: its use first, then what images and offsets say."""
+    """Yield a calibration's document as text: its use first, then images and offsets.
+
+    Args:
+        document: of a calibration report.
+
+    Yields:
+        Lines and tables: verdict, next steps, parameters, beads left out, motion,
+        markers.
+    """
     yield document["verdict"]
     for line in document.get("next", ()):
         yield f"next: {line}"
@@ -334,7 +358,7 @@ def show(document: Mapping[str, Any]) -> Iterator[str]:
 
 
 def motions(document: Mapping[str, Any]) -> Iterator[str]:
-    """What moved during the scans, in words."""
+    """Describe the motion during the scans in words."""
     for moved in document.get("motion", ()):
         for name, told in moved.items():
             if not told["moves"]:
@@ -349,8 +373,8 @@ def motions(document: Mapping[str, Any]) -> Iterator[str]:
 
 
 def parameter_rows(document: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    """Parameters as rows of text: name, value, sigma, its part from the images, unit. Those that
-    were not asked for and are estimated by their prior come last, in brackets."""
+    """Make rows of text of the parameters: name, value, sigma, its part from the
+    images, unit. Parameters estimated by their prior alone come last, in brackets."""
     return [
         (
             name if p["asked"] else f"({name})",
@@ -362,12 +386,12 @@ def parameter_rows(document: Mapping[str, Any]) -> list[tuple[str, ...]]:
 
 
 def write_json(path: Path, document: Mapping[str, object]) -> None:
-    """Write a document under its final name only when it is whole."""
+    """Write a document; it gets its final name only when it is complete."""
     write_whole(path, as_json(document) + "\n")
 
 
 def _rounded(estimate: Mapping[str, Any], *names: str) -> Iterator[str]:
-    """Numbers of an estimate, to the digits that its sigma leaves."""
+    """Format numbers of an estimate to the digits that its sigma leaves."""
     from flexdt.library.calibration.calibrate import digits
 
     return (digits(estimate[name], estimate["sigma"]) for name in names)

@@ -1,4 +1,5 @@
-"""`flexdt check`: a script parsed, planned and checked without a server, or beside its log."""
+"""`flexdt check`: parse, plan and check a script without a server, or compare it with
+its log."""
 
 from __future__ import annotations
 
@@ -68,7 +69,17 @@ def check(
 
 
 def compare(script: Path, log: Path, machine: str | None, html: Path | None) -> Answer:
-    """Each line of an executed script beside its prediction, the greatest errors first.
+    """Compare each line of an executed script with its prediction, the greatest errors
+    first.
+
+    Args:
+        script: file of the script, or the log itself.
+        log: file of the executed script.
+        machine: description; None for the default.
+        html: file for a report; None for none.
+
+    Returns:
+        Document and lines of the answer.
 
     Raises:
         CommandError: the log is not of this script; the message names the first line that differs.
@@ -96,7 +107,12 @@ def compare(script: Path, log: Path, machine: str | None, html: Path | None) -> 
 
 
 def show(report: CheckReport, file: str) -> Answer:
-    """The plan and the figures of a check."""
+    """Yield the plan and the figures of a check.
+
+    Args:
+        report: of the check.
+        file: name of the script, for the last line.
+    """
     from flexdt.twin.script.dry_run_report import between, summary
     from flexdt.twin.script.planning.time_ranges import step_range
 

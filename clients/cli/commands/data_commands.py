@@ -135,7 +135,16 @@ def reconstruct(
 
 
 def _check_together(given: Mapping[str, object], out: Path, kept_out: Iterable[str]) -> None:
-    """Usage errors of options that do not go together; a preview keeps some out."""
+    """Check that options go together.
+
+    Args:
+        given: options by name.
+        out: file of the volume.
+        kept_out: options that a preview sets itself.
+
+    Raises:
+        typer.BadParameter: they do not.
+    """
     from flexdt.library.reconstruction.volume_files import ending, endings
 
     algorithm = str(given.get("algorithm", DEFAULT))
@@ -160,7 +169,15 @@ def _check_together(given: Mapping[str, object], out: Path, kept_out: Iterable[s
 
 
 def _correction(named: str | None, twin: Twin) -> tuple[Offsets | None, Report | None]:
-    """The correction that was asked for, None for the scan's own, and the report it is from."""
+    """Read the chosen correction, and the report that it comes from.
+
+    Args:
+        named: a report's file, "twin" or "none"; None for the scan's own.
+        twin: connects, for "twin" only.
+
+    Returns:
+        Offsets and report; None for each that there is not.
+    """
     from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 
     match named:
@@ -179,7 +196,15 @@ def _correction(named: str | None, twin: Twin) -> tuple[Offsets | None, Report |
 def scan_of(
     folder: Path, texts: bool, report: Report | None, geometry: Path | None = None
 ) -> DataSet:
-    """The data set, with the motion and the panel of a report, or the geometry of a file."""
+    """Load the data set, with the motion and the panel of a report, or the geometry of a
+    file.
+
+    Args:
+        folder: of the data set.
+        texts: use the two settings texts only, not `flexdt.json`.
+        report: of a calibration; None for none.
+        geometry: file; None for the data set's own.
+    """
     from flexdt.library.reading.folders import load_dataset
 
     data = load_dataset(folder, ignore_document=texts)
@@ -216,7 +241,7 @@ def _shape(text: str) -> tuple[int, int, int]:
 
 @dataclass(frozen=True)
 class Report:
-    """What a report of `flexdt calibrate` holds for other scans, and for its own.
+    """Report of `flexdt calibrate`, for its own scan and for others.
 
     Attributes:
         path: the file; it may hold a plain object of parameters instead.
@@ -230,7 +255,14 @@ class Report:
 
 
 def read_report(path: Path) -> Report:
-    """Read a report of `flexdt calibrate`, or a plain object of parameters."""
+    """Read a report of `flexdt calibrate`, or a plain object of parameters.
+
+    Args:
+        path: of a JSON file.
+
+    Raises:
+        CommandError: not JSON, no correction in it, or a value that is not a number.
+    """
     from flexdt.twin.geometry.offsets import Offsets
 
     try:
@@ -247,7 +279,16 @@ def read_report(path: Path) -> Report:
 
 
 def moved(data: DataSet, report: Report) -> DataSet:
-    """The data set with the motion that a report of `flexdt calibrate --per-frame` has of it."""
+    """Apply the motion that a report of `flexdt calibrate --per-frame` has for the data
+    set.
+
+    Args:
+        data: the data set; a motion of another one is left out with a warning.
+        report: of the calibration.
+
+    Raises:
+        CommandError: the report's motion is not valid.
+    """
     path, told = report.path, report.document.get("motion")
     if told is None:
         return data
@@ -379,7 +420,17 @@ def import_(
 def said(
     like: Path | None, shape: str | None, pixel: str | None, views: int | None = None
 ) -> Given:
-    """What the options say that a geometry's file does not."""
+    """Read the options that complete a geometry's file.
+
+    Args:
+        like: data set to take values from; the other options override it.
+        shape: ROWS,COLS of the detector.
+        pixel: pitch [mm], MM or U,V.
+        views: number of projections.
+
+    Raises:
+        typer.BadParameter: a word of another form, or a pitch that is not above 0.
+    """
     size = pitch = None
     if shape is not None:
         form = "ROWS,COLS, e.g. 760,956"

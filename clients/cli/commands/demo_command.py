@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 SAMPLE: Final = "lego"
 SCRIPT: Final = "lego-fly-360.txt"
 PROGRAM: Final = "flexdt"
-"""The command, where it is on the path."""
+"""Name of the command, where it is on the path."""
 CALIBRATION: Final = "calibration.json"
 PICTURE: Final = "demo.png"
 PICTURE_ROWS: Final = 380
@@ -49,7 +49,7 @@ PICTURE_ROWS: Final = 380
 STAY_S: Final = 3600.0
 """Longest sleep while the lab stays up; Ctrl-C ends it at once."""
 Tell = Callable[[str], None]
-"""Called with each line of what is done."""
+"""Called with each line of progress."""
 
 
 def demo(
@@ -84,20 +84,21 @@ def demo(
 def run_demo(
     out: Path, truth_file: Path | None, tell: Tell, stay: Callable[[str], None] | None = None
 ) -> dict[str, Any]:
-    """Run every stage there is.
+    """Run all stages.
 
     Args:
-        out: folder for everything that is written, made if need be.
+        out: folder for all files, made if need be.
         truth_file: hidden misalignment; None draws one.
-        tell: told what is done, line by line.
-        stay: start the viewer too; called with its URL when the work is done, and the servers live
+        tell: called with each line of progress.
+        stay: start the viewer too; called with its URL when the work is done, and the
+            servers live
             until it returns.
 
     Returns:
         The document of `demo.json`.
 
     Raises:
-        CommandError: a stage did not do what it should; the line says which and what.
+        CommandError: a stage failed; the line names it and the reason.
     """
     from flexdt.clients.client.client import TwinClient
     from flexdt.runtime import compile_ahead
@@ -108,7 +109,8 @@ def run_demo(
         path = truth_file or running.enter_context(_drawn_truth())
         truth = hidden.read(path)
         tell("starting the servers; the very first start compiles the projector's kernels")
-        # What calibration and reconstruction need, beside the servers' start and the scan.
+        # Kernels of calibration and reconstruction compile during the servers' start and the
+        # scan.
         compiling = running.enter_context(compile_ahead.start(compile_ahead.ANALYSIS))
         options = {"data": data.absolute(), "truth": path.absolute(), "speed-up": "max"}
         servers = running.enter_context(_started(options, out, tell, viewer=stay is not None))
@@ -124,7 +126,7 @@ def run_demo(
 
 @contextlib.contextmanager
 def _drawn_truth() -> Iterator[Path]:
-    """The file of a random hidden misalignment, outside the folder of the results."""
+    """Write a random hidden misalignment to a file outside the folder of the results."""
     with tempfile.TemporaryDirectory(prefix="flexdt-truth-") as secret:
         path = Path(secret) / "truth.toml"
         hidden.write(hidden.draw(), path)
@@ -135,7 +137,7 @@ def _drawn_truth() -> Iterator[Path]:
 def _started(
     options: Mapping[str, object], out: Path, tell: Tell, *, viewer: bool
 ) -> Iterator[Servers]:
-    """Servers on free ports, and where they are."""
+    """Start servers on free ports and print their addresses; end them on leaving."""
     from flexdt.clients.launch.processes import Servers
 
     log = out / "servers.log"
@@ -157,14 +159,17 @@ def _main_job(
     out: Path,
     tell: Tell,
 ) -> dict[str, Any]:
-    """Scan, calibrate, put the correction in force and preview; returns the document.
+    """Scan, calibrate, put the correction in force and preview.
 
     Args:
         client: connected to the twin.
         compiled: returns once the kernels of calibration and reconstruction are compiled.
         truth: hidden misalignment, to compare with.
-        out: folder for everything that is written.
-        tell: told what is done, line by line.
+        out: folder for all files.
+        tell: called with each line of progress.
+
+    Returns:
+        The document of `demo.json`.
     """
     dataset, seconds = _scanned(client, out / "data", tell)
     with long_work.during("compiling the kernels of calibration and reconstruction"):
@@ -188,8 +193,20 @@ def _main_job(
 
 
 def _scanned(client: TwinClient, data: Path, tell: Tell) -> tuple[DataSet, float]:
-    """Run the example script on the twin and read the data set back with the ordinary reader; it
-    must be whole. Returns it and the wall time of the scan [s]."""
+    """Run the example script on the twin and read the data set back with the ordinary
+    reader.
+
+    Args:
+        client: connected to the twin.
+        data: the twin's data directory.
+        tell: called with each line of progress.
+
+    Returns:
+        The data set, which is complete, and the wall time of the scan [s].
+
+    Raises:
+        CommandError: the scan did not end as done.
+    """
     from flexdt.library.reading.folders import load_dataset
 
     client.set_sample(SAMPLE)
@@ -221,7 +238,15 @@ def _scanned(client: TwinClient, data: Path, tell: Tell) -> tuple[DataSet, float
 
 
 def _calibrated(dataset: DataSet, tell: Tell) -> Outcome[DataSet]:
-    """Calibrate from the data set alone."""
+    """Calibrate from the data set alone.
+
+    Args:
+        dataset: of the example scan.
+        tell: called with each line of progress.
+
+    Raises:
+        CommandError: the calibration is not identifiable.
+    """
     from flexdt.library.calibration.calibrate import calibrate_datasets
 
     begun = time.monotonic()
@@ -240,7 +265,7 @@ def _calibrated(dataset: DataSet, tell: Tell) -> Outcome[DataSet]:
 def _previewed(
     dataset: DataSet, outcome: Outcome[DataSet], out: Path, tell: Tell
 ) -> dict[str, object]:
-    """A small volume with the calibrated geometry."""
+    """Reconstruct a small volume with the calibrated geometry."""
     from flexdt.library.reconstruction.reconstruct import preview
 
     fit = outcome.calibration.fit
@@ -252,12 +277,13 @@ def _previewed(
 
 
 def _pictured(dataset: DataSet, volume: Path, out: Path) -> Path:
-    """Draw the first radiograph beside the middle layer of a volume, equally high.
+    """Draw the first radiograph and the middle layer of a volume side by side, equally
+    high.
 
     Args:
         dataset: of the radiograph.
         volume: file of the volume.
-        out: where the PNG goes.
+        out: file of the PNG.
 
     Returns:
         `out`.
@@ -280,7 +306,7 @@ def _pictured(dataset: DataSet, volume: Path, out: Path) -> Path:
 
 
 def _told_the_end(document: dict[str, Any], out: Path, tell: Tell) -> None:
-    """Say the verdict, where the picture is, and what to do next."""
+    """Print the verdict, the files and the next commands."""
     program = PROGRAM if shutil.which(PROGRAM) else sys.argv[0]
     dataset = shlex.quote(document["dataset"])
     folder = shlex.quote(str(out))
@@ -296,7 +322,16 @@ def _told_the_end(document: dict[str, Any], out: Path, tell: Tell) -> None:
 
 
 def _compared(outcome: Outcome[DataSet], truth: Mapping[str, float], tell: Tell) -> bool:
-    """Set the calibration beside the hidden truth; a miss is called a miss."""
+    """Compare the calibration with the hidden truth; a miss is called a miss.
+
+    Args:
+        outcome: of the calibration.
+        truth: parameter -> value [mm, deg].
+        tell: called with each line of progress.
+
+    Returns:
+        Whether the truth lies inside the joint 95 % ellipsoid.
+    """
     from flexdt.library.calibration.calibrate import inside_95
 
     rows = []

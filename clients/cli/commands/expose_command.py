@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from flexdt.library.expose import Forecast, Measured, Transmission
 
 BEST: Final = 5
-"""Proposed settings that are shown."""
+"""Number of proposed settings that are shown."""
 
 
 def expose(
@@ -93,6 +93,11 @@ def _seen(found: Forecast | Measured) -> Answer:
 
 
 def _told(forecast: Forecast) -> Answer:
+    """Yield the forecast as text: counts, contrast, dose and the best settings.
+
+    Args:
+        forecast: of the exposure.
+    """
     yield from _seen(forecast)
     asked = forecast.asked
     seen = "not seen: these pixels are saturated"

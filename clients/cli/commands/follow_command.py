@@ -1,4 +1,4 @@
-"""`flexdt follow`: a real scanner's messages beside the twin's prediction."""
+"""`flexdt follow`: compare a real scanner's messages with the twin's prediction."""
 
 from __future__ import annotations
 
@@ -114,6 +114,14 @@ def _unread(session: FollowSession) -> str:
 def _follower(
     machine: str | None, profile: str | None, script: Path | None, sample: str | None
 ) -> Follower:
+    """Build the follower of a machine, with its profile, script and sample.
+
+    Args:
+        machine: name or file; None for the default.
+        profile: name or file of the zero offsets; None for the machine's own.
+        script: file of the script that will run; None for none.
+        sample: phantom on the stage; None for none.
+    """
     from flexdt.library.scripts import collisions, size_of
     from flexdt.phantoms.samples import as_phantom
     from flexdt.twin.following.follower import Follower
@@ -149,7 +157,8 @@ async def _run(
 
 
 async def _status(session: FollowSession) -> None:
-    """Say now and then how old what is known is."""
+    """Print every `STATUS_S` seconds the age of the last message and the commands
+    under way."""
     while True:
         await asyncio.sleep(STATUS_S)
         mirror = session.mirror

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from flexdt.protocol.state_model import JobStatus
 
 ALL: Final = "all"
-"""Names every job that has ended."""
+"""Word for every job that has ended."""
 Job = Annotated[
     str | None, typer.Argument(metavar="JOB", help="As in `job list`; the current one if left out.")
 ]
@@ -85,12 +85,15 @@ def run(
 
 
 def failure_code(status: JobStatus) -> int:
-    """Exit code of a job that did not end well."""
+    """Determine the exit code of a job that did not end well."""
     return WIRE_EXIT_CODES.get((status.error or {}).get("code"), INVALID)
 
 
 def follow(client: TwinClient, job: str, *, own: bool = False) -> JobStatus:
-    """Show a job's progress until it ends; returns its last status.
+    """Show a job's progress until it ends.
+
+    Returns:
+        Its last status.
 
     Args:
         client: connected to the twin.
@@ -136,7 +139,12 @@ def list_jobs(twin: Twin) -> Answer:
 
 
 def _on_job(does: str, method: str) -> Callable[..., Answer]:
-    """A command that does something with one job and shows how the job is then."""
+    """Make a command that acts on one job and shows its new status.
+
+    Args:
+        does: help of the command.
+        method: of the client, called with the job.
+    """
 
     def command(twin: Twin, job: Job = None) -> Answer:
         with twin() as client:
@@ -161,7 +169,7 @@ def forget(
 
 
 def describe(status: JobStatus) -> str:
-    """A job in one line."""
+    """Format a job as one line."""
     text = f"{status.job}: {status.state}, {status.frames_done} of {status.frames_total} frames"
     if status.line is not None:
         text += f", line {status.line}"

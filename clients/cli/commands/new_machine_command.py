@@ -100,7 +100,8 @@ def new(
 
 
 def _asked(question: str, given: str | None, usual: str) -> str | None:
-    """What was given, else what a person at a terminal answers; None for what is usual."""
+    """Return the given value, else the answer of a person at a terminal; None for the
+    usual one."""
     if given is not None or not sys.stdin.isatty():
         return given
     answer: str = typer.prompt(question, default=usual, err=True)

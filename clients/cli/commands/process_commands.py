@@ -25,7 +25,7 @@ MODULES: Final = {
     "viewer": "flexdt.clients.viewer.main",
     "gateway": "flexdt.clients.gateway.main",
 }
-"""Process -> its program."""
+"""Process -> module of its program."""
 Only = Annotated[
     Literal["twin", "projector", "viewer", "gateway"] | None,
     typer.Option("--only", help="Run this process alone; its options: flexdt PROCESS --help."),
@@ -43,7 +43,8 @@ def up(context: typer.Context, only: str | None, **given: object) -> None:
 
 
 def _public() -> list[inspect.Parameter]:
-    """What `up` lists: left out it is None, so that the settings file can say it."""
+    """List the options that `up` shows; one left out is None, so that the settings
+    file can set it."""
     public = {f.name for f in fields(UpSettings) if f.metadata["public"]}
     own = [p for name, p in parameters(UpSettings).items() if name in public]
     return [p if p.default is False else p.replace(default=None) for p in own]
@@ -57,7 +58,7 @@ has_parameters(up, [
 
 
 def alone(name: str, about: str) -> Callable[[typer.Context], None]:
-    """The command that runs one process with the words that follow it."""
+    """Make the command that runs one process with the words that follow it."""
 
     def command(context: typer.Context) -> None:
         start(name, context.args)
@@ -78,7 +79,8 @@ gateway = alone(
 
 
 def start(name: str, more: Sequence[str]) -> None:
-    """Become a process, with the settings file's options and then those of `more` words."""
+    """Run a process in this interpreter, with the settings file's options and then
+    those of `more`."""
     settings = settings_of(TABLES[name], more)
     if settings is not None:
         given = {f.name: getattr(settings, f.name) for f in fields(settings)}
@@ -87,7 +89,11 @@ def start(name: str, more: Sequence[str]) -> None:
 
 
 def _check(given: Mapping[str, Any]) -> None:
-    """Usage errors that no single option can have."""
+    """Check options against each other, and that the machine can be read.
+
+    Raises:
+        typer.BadParameter: options that do not go together.
+    """
     if (given.get("tls_cert") is None) != (given.get("tls_key") is None):
         raise typer.BadParameter("--tls-cert and --tls-key go together")
     if given.get("projector") is not None and given["projector_port"] is not None:
@@ -99,7 +105,9 @@ def _check(given: Mapping[str, Any]) -> None:
 
 
 def become(module: str, given: Mapping[str, object], more: Sequence[str] = ()) -> NoReturn:
-    """Be the process that `python -m module` is, with the options `given` and `more` words.
+    """Run `python -m module` in this process, with the options `given` and `more` words.
+
+    A new interpreter would not react to Ctrl-C before it had loaded the module.
 
     In this interpreter: a new one would not hear of Ctrl-C before it had loaded the module.
 

@@ -1,7 +1,8 @@
-"""`flexdt state`, `move`, `jog`, `stop`, `tube`, `camera`, `sample`, `snap` and their like.
+"""`flexdt state`, `move`, `jog`, `stop`, `tube`, `camera`, `sample`, `snap` and their
+like.
 
-They show or set what a running twin has. The twin checks ranges and limits; its error is printed as
-it comes.
+They show or set the state of a running twin. The twin checks ranges and limits; its error
+is printed as it comes.
 """
 
 from __future__ import annotations
@@ -51,6 +52,8 @@ def _axis(name: str, axis: AxisState) -> tuple[str, ...]:
 
 
 def _facts(state: State) -> list[tuple[str, str]]:
+    """List the facts of a state as label and text: geometry, tube, camera, sample,
+    safety and so on."""
     g, c, t, s = state.geometry, state.camera, state.tube, state.sample
     rows, cols = c.shape
     facts = [
@@ -99,7 +102,7 @@ def tube(
 
 
 def xrays(tube: TubeState) -> str:
-    """Off, on, or when they will be ready."""
+    """Format the tube's X-rays: off, on, or the time until they are ready."""
     if tube.on and not tube.ready:
         return f"on, ready in {tube.ready_in_s or 0.0:.1f} s"
     return "on" if tube.on else "off"
@@ -140,11 +143,11 @@ def clock(twin: Twin, speed_up: str = argument(..., "X or max")) -> Answer:
 
 
 JOG_LEASE_S = 1.0
-"""How long an axis goes on after this process has died, in real seconds."""
+"""Length of a lease: an axis moves on so long after this process has died [real s]."""
 LONGEST_LEASE_S = 10.0
-"""The wire's, on the twin's clock."""
+"""Longest lease that the wire allows [twin s]."""
 JOG_RENEWED = 0.3
-"""After which part of a lease the next one is taken."""
+"""Part of a lease after which the next one is requested."""
 JOG_POLL_S = 0.002
 
 
@@ -211,7 +214,15 @@ def jog(
 
 
 def _lease(client: TwinClient, axis: str, speed: float, seconds: float) -> None:
-    """Jog for so many seconds of the twin's clock, lease after lease, at whatever speed it runs."""
+    """Jog for so many seconds of the twin's clock, lease after lease, at any speed of the
+    clock.
+
+    Args:
+        client: connected to the twin.
+        axis: name of the motor.
+        speed: [mm/s, deg/s], signed.
+        seconds: on the twin's clock [s]; the end of the travel ends it earlier.
+    """
     now, left, shown = client.state(), seconds, ""
     while left > 0:
         pace = math.inf if now.clock.speed_up == "max" else now.clock.speed_up
@@ -235,8 +246,9 @@ def _lease(client: TwinClient, axis: str, speed: float, seconds: float) -> None:
 def _outwait(client: TwinClient, axis: str, duration_s: float) -> State:
     """Wait until a lease has ended by itself, and return the state then.
 
-    The last lease ends to the moment. Where time runs as fast as it can, every lease does: a
-    renewal could come before or after its end, and nobody would know for how long the axis moved.
+    The last lease runs out by itself, to the moment. At the fastest clock every lease
+    does: a renewal could come before or after its end, and the time of motion would be
+    unknown.
     """
     now = client.state()
     end = now.time + duration_s  # counted from after its start, not from before
@@ -263,7 +275,7 @@ def estop(twin: Twin) -> Answer:
 
 
 def _rest(state: Stopped) -> str:
-    """How the motors come to rest, in words."""
+    """Describe how the motors come to rest, in words."""
     stopping = state.stopping
     if stopping is None or not stopping.distances:
         return "nothing moves"
@@ -275,7 +287,7 @@ def _rest(state: Stopped) -> str:
 def reset(twin: Twin) -> Answer:
     """Leave the emergency stop."""
     with twin() as client:
-        seen = client.state().safety  # what is released; a twin of before has no number for it
+        seen = client.state().safety  # the stop to release; an older twin has no number for it
         current = client.reset(seen.stop or None)
     why = f": {current.safety.message}" if current.safety.message else ""
     yield current
@@ -411,6 +423,12 @@ def save(
     marks: npt.NDArray[Any] | None = None,
 ) -> None:
     """Write an image as TIFF, or windowed to 8 bit as PNG, with its marks in colour.
+
+    Args:
+        file: its ending selects the format.
+        image: (rows, cols).
+        dark_is_dense: draw dense parts dark, in a PNG.
+        marks: (rows, cols) of pixels to colour, in a PNG; None for none.
 
     Raises:
         OSError: the file cannot be written.

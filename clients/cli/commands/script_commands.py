@@ -18,7 +18,7 @@ from flexdt.library import machines
 from flexdt.library.failure import CommandError
 
 Kind = Literal["fly", "step", "tiled", "helical", "calibration"]
-"""As `compose.Kind`, which is not imported for the help's sake."""
+"""Kinds of `compose.Kind`, which is not imported to keep the help fast."""
 
 
 def new(
@@ -101,7 +101,14 @@ def new(
 
 
 def _own(kind: Kind, **given: Any) -> dict[str, Any]:
-    """Members of a request that belong to one kind of scan.
+    """Collect members of a request that belong to one kind of scan.
+
+    Args:
+        kind: of the scan.
+        given: options by name; those left out are None or empty.
+
+    Returns:
+        Member -> value, as `ScanRequest` has them.
 
     Raises:
         typer.BadParameter: an option of another kind was given.

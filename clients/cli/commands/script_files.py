@@ -1,4 +1,4 @@
-"""Scripts and their logs as arguments of commands: what is read, and what is told of problems."""
+"""Scripts and their logs as arguments of commands: read them and print their problems."""
 
 from __future__ import annotations
 
@@ -22,7 +22,13 @@ ScriptFile = Annotated[Path, typer.Argument(metavar="SCRIPT", help="Acquila scan
 
 
 def read_log_file(log: Path, machine: Machine) -> tuple[Executed, ...]:
-    """The lines of an executed script, or of one in a recording of `flexdt follow`.
+    """Read the lines of an executed script, or of one in a recording of `flexdt follow`.
+
+    Its problems are printed to standard error.
+
+    Args:
+        log: file.
+        machine: of the script, to read a recording.
 
     What is worth knowing about them goes to standard error.
 
@@ -48,12 +54,12 @@ def read_log_file(log: Path, machine: Machine) -> tuple[Executed, ...]:
 
 
 def tell(problems: Sequence[ScriptProblem], file: str) -> None:
-    """Problems with their places, to standard error."""
+    """Print problems with their places to standard error."""
     for p in problems:
         place = ":".join([file, *(str(n) for n in (p.line, p.column) if p.line)])
         note(f"{place}: {p.severity}: {p.message} [{p.code}]")
 
 
 def exit_code(report: CheckReport) -> int:
-    """Exit code of a check."""
+    """Determine the exit code of a check."""
     return verdict(p.code for p in report.problems if p.severity == "error")
