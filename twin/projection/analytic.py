@@ -51,9 +51,9 @@ LEVEL = ConeVec.from_vectors((0, -10, 0), (0, 10, 0), (1, 0, 0), (0, 0, -1))
 END_ON = ConeVec.from_vectors((0, 0, -10), (0, 0, 10), (1, 0, 0), (0, 1, 0))
 IntArray = npt.NDArray[np.int64]
 ASIDE = (1.37e-7, 0.73e-7)
-"""Rays are aimed this much [columns, rows] beside the pixel's centre. Made objects have corners
-exactly on pixel centres; there, rounding alone would decide which triangles a ray meets.
-"""
+"""Offset of each ray from its pixel's centre [columns, rows]. Made objects have
+corners exactly on pixel centres; there, rounding alone would decide which triangles a
+ray meets."""
 
 
 def project_scene(
@@ -62,7 +62,8 @@ def project_scene(
     shape: Shape2 | None = None,
     out: Float32Array | None = None,
 ) -> Float32Array:
-    """Line integrals of a scene: sum over its solids of chord [mm] times mu [1/mm].
+    """Compute line integrals of a scene: sum over its solids of chord [mm] times mu
+    [1/mm].
 
     Args:
         scene: solids, object frame.
@@ -94,12 +95,12 @@ def project_scene(
 def project_materials(
     scene: Scene, cone_vec: ConeVec | npt.ArrayLike, shape: Shape2 | None = None
 ) -> dict[str, Float32Array]:
-    """Path length through each material of a scene.
+    """Compute the path length through each material of a scene.
 
-    A solid of negative mu_per_mm removes its material, so a bead in a brick is three solids: the
-    brick, a hole of the brick's material with minus its mu, and the bead with its own mu. (One
-    bead carrying the difference of two materials gives the right line integral, but cannot be
-    taken apart again.)
+    A solid of negative mu_per_mm removes its material, so a bead in a brick is three
+    solids: the brick, a hole of the brick's material with minus its mu, and the bead with
+    its own mu. (One bead carrying the difference of two materials gives the right line
+    integral, but cannot be taken apart again.)
 
     Args:
         scene: solids, object frame.
@@ -107,7 +108,8 @@ def project_materials(
         shape: detector (rows, cols); default: the geometry's own.
 
     Returns:
-        For each material name, in order of first appearance, float32 (n, rows, cols) [mm].
+        For each material name, in order of first appearance, float32 (n, rows, cols)
+            [mm].
 
     Raises:
         GeometryError: cone_vec, shape or a solid does not hold.
@@ -137,6 +139,16 @@ def _project(
     channel: npt.NDArray[np.int64],
     out: Float32Array,
 ) -> None:
+    """Fill out (channels, n, rows, cols) with the solids' chords times their weights.
+
+    Args:
+        solids: the k solids, object frame.
+        geometry: n views.
+        shape: detector (rows, cols).
+        weight: (k,) factor of each solid's chord.
+        channel: (k,) index of the image stack to which each solid adds.
+        out: float32, filled.
+    """
     from flexdt.twin.projection.kernels import analytic_kernels
 
     if not solids or out.size == 0:
@@ -159,9 +171,9 @@ def _project(
 
 
 CHORD_NS = 20.0
-"""Estimated time of a solid at a pixel of its shadow."""
+"""Estimated time of a solid at a pixel of its shadow [ns]."""
 TRIANGLE_NS = 20.0
-"""Estimated time of a triangle for each band of rows and, of small ones, for each of its pixels."""
+"""Estimated time of a triangle per band of rows, and of a small one per pixel [ns]."""
 
 
 def warm_up() -> None:
@@ -192,7 +204,7 @@ def warm_up_back() -> None:
 
 
 def _tiny_volumes() -> tuple[Volume, Volume]:
-    """In C order, and with z contiguous."""
+    """Make two volumes of a few voxels, in C order and with z contiguous."""
     data = np.ones((4, 3, 2), np.float32)
     turned = np.ascontiguousarray(data.transpose(1, 2, 0)).transpose(2, 0, 1)
     return Volume(data, 0.5), Volume(turned, 0.5)
@@ -250,7 +262,7 @@ def project_mesh(
     shape: Shape2 | None = None,
     out: Float32Array | None = None,
 ) -> Float32Array:
-    """Path length [mm] through a mesh along every ray.
+    """Compute the path length [mm] through a mesh along every ray.
 
     Args:
         mesh: the solid.
@@ -296,7 +308,7 @@ def project_mesh(
 
 
 def _check_closed(faces: IntArray, vertices: int) -> None:
-    """Every edge must be run through as often one way as the other."""
+    """Check that every edge is passed as often in one direction as in the other."""
     start = faces.ravel()
     end = faces[:, [1, 2, 0]].ravel()
     there, back = start * vertices + end, end * vertices + start
@@ -319,10 +331,10 @@ Body = Scene | Volume | TriangleMesh
 
 
 def project_body(body: Body, cone_vec: ConeVec | npt.ArrayLike, shape: Shape2) -> Float32Array:
-    """Line integrals through solids or voxels, path lengths [mm] through a mesh.
+    """Project solids or voxels to line integrals, a mesh to path lengths [mm].
 
     Args:
-        body: what is projected.
+        body: solids, voxels or a mesh.
         cone_vec: ConeVec or (n, 12) [mm], in the body's frame.
         shape: detector (rows, cols).
 

@@ -29,7 +29,7 @@ Matrix = tuple[Vector, Vector, Vector]
 IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 IntArray = npt.NDArray[np.int64]
 UNIT_TOLERANCE = 1e-6
-"""How far directions may be from orthonormal."""
+"""Largest deviation of directions from orthonormal ones."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ class Convex:
 
 
 def as_convex(shape: Shape) -> Convex:
-    """One shape as quadric and slabs."""
+    """Convert one shape to its quadric and slabs."""
     none = np.zeros((0, 5))
     match shape:
         case Sphere(center, radius):
@@ -158,7 +158,7 @@ def as_convex(shape: Shape) -> Convex:
 
 
 def hull_points(one: Convex) -> FloatArray:
-    """Points whose convex hull holds a solid, (k, 3) [mm]."""
+    """Compute points whose convex hull holds a solid, (k, 3) [mm]."""
     if one.corners is not None:
         return one.corners
     assert one.semi_axes is not None
@@ -166,12 +166,15 @@ def hull_points(one: Convex) -> FloatArray:
 
 
 def shadows(shapes: Sequence[Convex], rays: FloatArray, shape: tuple[int, int]) -> IntArray:
-    """Pixels each solid can darken: (n, k, 4) = first row, last row + 1, first column, last + 1.
+    """Find the pixels that each solid can darken.
 
     Args:
         shapes: the k solids.
         rays: (n, 12) as of `ConeVec.rays`.
         shape: detector (rows, cols).
+
+    Returns:
+        (n, k, 4) first row, last row + 1, first column, last column + 1.
     """
     result = np.empty((len(rays), len(shapes), 4), np.int64)
     inverse = _inverses(rays)
@@ -196,13 +199,15 @@ def shadows(shapes: Sequence[Convex], rays: FloatArray, shape: tuple[int, int]) 
 
 
 def corner_shadows(corners: FloatArray, rays: FloatArray, shape: tuple[int, int]) -> IntArray:
-    """Pixels that the convex hull of points can darken, (n, 4) as in `shadows`; all pixels when a
-    point is not in front of the source.
+    """Find the pixels that the convex hull of points can darken.
 
     Args:
         corners: (m, 3) [mm].
         rays: (n, 12) as of `ConeVec.rays`.
         shape: detector (rows, cols).
+
+    Returns:
+        (n, 4) as in `shadows`; all pixels when a point is not in front of the source.
     """
     at = np.einsum("nij,nkj->nki", _inverses(rays), corners - rays[:, None, :3])
     depth = at[:, :, 2]
@@ -213,8 +218,13 @@ def corner_shadows(corners: FloatArray, rays: FloatArray, shape: tuple[int, int]
 
 
 def _inverses(rays: FloatArray) -> FloatArray:
-    """What takes points seen from the source to (column, row, 1) times their depth, in distances of
-    the panel, (n, 3, 3).
+    """Compute matrices that map points seen from the source to (column, row, 1) times
+    depth.
+
+    Depth is in distances of the panel.
+
+    Returns:
+        (n, 3, 3).
     """
     basis = np.stack([rays[:, 6:9], rays[:, 9:12], rays[:, 3:6]], axis=2)
     return np.asarray(np.linalg.inv(basis))
@@ -223,7 +233,9 @@ def _inverses(rays: FloatArray) -> FloatArray:
 def _pixels(
     low: FloatArray, high: FloatArray, ahead: npt.NDArray[np.bool_], shape: tuple[int, int]
 ) -> IntArray:
-    """Real ranges (n, 2) of columns and rows as whole pixels, (n, 4); all where not `ahead`."""
+    """Convert real ranges (n, 2) of columns and rows to whole pixels (n, 4); all if not
+    `ahead`.
+    """
     first = np.where(ahead[:, None], np.ceil(low - 1e-6), 0).clip(0, shape[::-1])
     last = np.where(ahead[:, None], np.floor(high + 1e-6) + 1, np.inf).clip(0, shape[::-1])
     ends = [first[:, 1], last[:, 1], first[:, 0], last[:, 0]]
@@ -236,10 +248,11 @@ def _corners(center: FloatArray, axes: FloatArray, half: FloatArray) -> FloatArr
 
 
 def polyhedron_corners(shape: ConvexPolyhedron) -> FloatArray:
-    """Corner points of an intersection of half-spaces, (m, 3) [mm].
+    """Compute the corner points of an intersection of half-spaces, (m, 3) [mm].
 
     Raises:
-        GeometryError: a normal is not of unit length, or the half-spaces enclose no bounded solid.
+        GeometryError: a normal is not of unit length, or the half-spaces enclose no
+            bounded solid.
     """
     from scipy.optimize import linprog
     from scipy.spatial import HalfspaceIntersection, QhullError

@@ -28,15 +28,16 @@ from flexdt.twin.projection.portions import (
 from flexdt.twin.projection.volume import LANES
 
 ROOM = 64 << 20
-"""Bytes of transposed images at a time (one image, if that is more)."""
+"""Largest size of the transposed images held at a time [bytes], at least one image."""
 TILE = 8
-"""Detector columns a job of single rays."""
+"""Detector columns in a job of single rays."""
 
 
 def runs(views: FloatArray, shape: tuple[int, int]) -> Iterator[tuple[slice, bool]]:
-    """Ranges of neighbouring views of one orientation, each with whether it is transposed.
+    """Yield ranges of neighbouring views of one orientation, each with its transposition.
 
-    Of those that lie no more than fit into ROOM.
+    A range holds at most as many views as fit into ROOM. The second value is True when
+    rows and columns of these views are exchanged.
     """
     on_side = lying(views, shape)
     most = max(1, ROOM // (4 * shape[0] * shape[1]))
@@ -55,7 +56,7 @@ def project(box: Box, views: FloatArray, out: Float32Array, *, fans: bool = True
         box: the volume.
         views: (n, 12) source, first pixel minus source, u, v in voxel units of the box.
         out: C-ordered float32.
-        fans: False for rays that all travel alone.
+        fans: False to walk every ray on its own.
     """
     from flexdt.twin.projection.kernels import fan_kernels
 
@@ -82,7 +83,7 @@ def project(box: Box, views: FloatArray, out: Float32Array, *, fans: bool = True
 
 
 def _project_alone(box: Box, views: FloatArray, chosen: IntArray, out: Float32Array) -> None:
-    """Fill the chosen views of out with rays that all travel alone."""
+    """Fill the chosen views of out with rays that are walked one by one."""
     from flexdt.twin.projection.kernels import siddon_kernels
 
     jobs = len(chosen) * -(-out.shape[2] // TILE)
@@ -91,21 +92,21 @@ def _project_alone(box: Box, views: FloatArray, chosen: IntArray, out: Float32Ar
 
 
 def tile_ns(box: Box, rows: int) -> float:
-    """Estimated time of TILE detector columns of rays that travel alone."""
+    """Estimate the time of TILE detector columns of single rays [ns]."""
     return TILE * rows * ray_ns((box.nx, box.ny, box.nz))
 
 
 def spread(
     box: Box, views: FloatArray, values: Float32Array, *, clean: bool = True, fans: bool = True
 ) -> None:
-    """The transpose of `project`: values (n, rows, cols) into box.flat.
+    """Apply the transpose of `project`: add values (n, rows, cols) to box.flat.
 
     Args:
         box: the volume; its spans are not used.
         views: as in `project`.
         values: C-ordered float32.
-        clean: box.flat holds zeros; otherwise whatever it holds is overwritten.
-        fans: False for rays that all travel alone.
+        clean: True if box.flat holds zeros; otherwise its content is overwritten.
+        fans: False to walk every ray on its own.
     """
     shape = (values.shape[1], values.shape[2])
     for some, turned in runs(views, shape) if fans else [(slice(None), False)]:
@@ -146,7 +147,10 @@ def _spread(box: Box, views: FloatArray, values: Float32Array, clean: bool, fans
 
 
 def z_slices(nz: int, count: int) -> IntArray:
-    """At most `count` ranges (s, 2) of about equal height, cut at whole cache lines."""
+    """Cut nz levels into at most `count` ranges (s, 2) of about equal height.
+
+    Cuts are at whole cache lines.
+    """
     lines = -(-nz // LANES)
     edges = np.unique(np.arange(count + 1) * lines // count) * LANES
     edges[-1] = nz
@@ -156,15 +160,17 @@ def z_slices(nz: int, count: int) -> IntArray:
 def box_shadows(
     box: Box, views: FloatArray, levels: tuple[int, int], shape: tuple[int, int]
 ) -> IntArray:
-    """Pixels that levels [low, high) of a box can reach: (n, 4) = first row, last row + 1, first
-    column, last column + 1.
+    """Find the pixels that levels [low, high) of a box can reach.
+
+    Returns:
+        (n, 4) first row, last row + 1, first column, last column + 1.
     """
     ends = [[x, y, z] for x in (0, box.nx) for y in (0, box.ny) for z in levels]
     return corner_shadows(np.array(ends, dtype=np.float64), views, shape)
 
 
 def threads() -> int:
-    """How many threads the kernels use."""
+    """Return the number of threads that the kernels use."""
     import numba
 
     return int(numba.get_num_threads())

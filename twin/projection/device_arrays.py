@@ -20,7 +20,7 @@ from flexdt.twin.projection.operators import layout_data
 from flexdt.twin.projection.volume import DeviceVolume, Volume, blank_layout
 
 UFUNCS = {np.add: "ADD", np.subtract: "SUBTRACT", np.multiply: "MULTIPLY", np.maximum: "MAXIMUM"}
-"""What there is of numpy's functions, and what the kernel calls it."""
+"""numpy function -> name in the kernel, for the functions that are supported."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,18 +41,18 @@ class DeviceArray(NDArrayOperatorsMixin):
 
     @classmethod
     def of_images(cls, images: Any) -> DeviceArray:
-        """(n, rows, cols), of the host, or on the device, whose memory is shared."""
+        """Take images (n, rows, cols) from the host, or share their memory on the device."""
         there = images if gpu.is_there(images) else gpu.demand(lambda: gpu.upload(images))
         return cls(there.reshape(images.size), images.shape)
 
     @classmethod
     def of_volume(cls, volume: DeviceVolume) -> DeviceArray:
-        """The voxels of a volume that has room for all of its grid; their memory is shared."""
+        """Share the voxels of a device volume that has memory for all of its grid."""
         return cls(volume.layout.flat, volume.shape, volume)
 
     @classmethod
     def of_voxels(cls, volume: Volume) -> DeviceArray:
-        """The voxels of a volume of the host, copied there."""
+        """Copy the voxels of a volume from the host."""
         layout = blank_layout(volume)
         layout_data(layout)[...] = volume.data
         layout = replace(layout, flat=gpu.demand(lambda: gpu.upload(layout.flat)))
@@ -60,17 +60,19 @@ class DeviceArray(NDArrayOperatorsMixin):
 
     @property
     def images(self) -> Any:
-        """Numba's array of its shape, the memory shared."""
+        """The images as numba's array of that shape; the memory is shared."""
         return self.flat.reshape(self.shape)
 
     @property
     def volume(self) -> DeviceVolume:
-        """The voxels as a volume, the memory shared."""
+        """The voxels as a volume; the memory is shared."""
         assert self.grid is not None
         return replace(self.grid, layout=replace(self.grid.layout, flat=self.flat))
 
     def __getitem__(self, views: slice | npt.NDArray[np.intp]) -> DeviceArray:
-        """A copy of the images of some views; of a slice, which is of all, these themselves."""
+        """Copy the images of some views; a slice over all views returns this array
+        itself.
+        """
         if isinstance(views, slice):
             return self
 
@@ -88,12 +90,13 @@ class DeviceArray(NDArrayOperatorsMixin):
 
     @property
     def size(self) -> int:
-        """How many numbers."""
+        """Number of elements."""
         return int(np.prod(self.shape))
 
     def __array_ufunc__(
         self, ufunc: np.ufunc, method: str, *inputs: Any, out: Any = None, **options: Any
     ) -> Any:
+        """Apply a function of UFUNCS on the device; other functions are not implemented."""
         a, b = inputs if len(inputs) == 2 else (self, None)
         if not isinstance(a, DeviceArray) and ufunc is not np.subtract:
             a, b = b, a  # the other three are the same either way round
@@ -109,11 +112,11 @@ class DeviceArray(NDArrayOperatorsMixin):
         return _combined(UFUNCS[ufunc], a, other, None if out is None else out[0])
 
     def over(self, other: DeviceArray, least: float) -> DeviceArray:
-        """self / other, and 0 where other is at most `least`."""
+        """Compute self / other, and 0 where other is at most `least`."""
         return _combined("RATIO", self, other, least=least)
 
     def copy(self, order: str = "K") -> DeviceArray:
-        """The same numbers in memory of their own."""
+        """Copy the numbers to new memory."""
         return _combined("ADD", self, 0.0)
 
     def dot(self, other: DeviceArray) -> float:
@@ -121,11 +124,11 @@ class DeviceArray(NDArrayOperatorsMixin):
         return float(_folded("DOT", self, other).sum())
 
     def sum(self) -> float:
-        """Of all numbers."""
+        """Sum all numbers."""
         return float(_folded("SUM", self, self).sum())
 
     def max(self) -> float:
-        """The largest number."""
+        """Return the largest number."""
         return float(_folded("LARGEST", self, self).max())
 
 
@@ -136,6 +139,14 @@ def _combined(
     out: DeviceArray | None = None,
     least: float = 0.0,
 ) -> DeviceArray:
+    """Apply a function of the kernel elementwise to `a` and an array or a number `b`.
+
+    Args:
+        name: name of the function in the kernel.
+        a, b: operands; b is an array or a number.
+        out: array for the result, `a` for example; None for new memory.
+        least: smallest denominator of a ratio; see `DeviceArray.over`.
+    """
     if isinstance(b, DeviceArray) and b.shape != a.shape:
         raise GeometryError.of_shape("an array on the device", b.shape, a.shape, ", the other's")
 
@@ -160,6 +171,8 @@ def _combined(
 
 
 def _folded(name: str, a: DeviceArray, b: DeviceArray) -> FloatArray:
+    """Reduce one or two arrays on the device to partial results in double precision."""
+
     def launch() -> FloatArray:
         from numba import cuda
 

@@ -27,7 +27,7 @@ from flexdt.twin.projection.kernels.fan_types import Fans
 IntArray = npt.NDArray[np.int64]
 
 FANS = 16
-"""Fans a job: their columns fill whole cache lines of the image."""
+"""Fans in a job: their columns fill whole cache lines of the image."""
 SPREAD = 0.9
 """Largest lateral spread of a fan [voxels]: less than one, as the kernel's corrections demand."""
 WIDEST = 4.0
@@ -35,24 +35,30 @@ WIDEST = 4.0
 FACING = 0.25
 """Least cosine between any ray and the view's horizontal direction for the view to have fans."""
 APART = 0.25
-"""Least distance of two fan boundaries in any row, as a share of that in the middle row."""
+"""Least distance of two fan boundaries in any row, as a share of that in the middle
+row."""
 MOST = 64
-"""Most fans of a view, per row and column of the detector."""
+"""Largest number of fans of a view, per row and column of the detector."""
 EXCHANGED = [0, 1, 2, 3, 4, 5, 9, 10, 11, 6, 7, 8]
-"""A view (source, first pixel minus source, u, v) with u and v exchanged."""
+"""Order of a view's numbers (source, first pixel minus source, u, v) with u and v
+exchanged."""
 LEVEL = 1e-12
-"""Detector columns whose ends are nearer than this [voxels] in x and y are parallel to z."""
+"""Largest distance in x and y of the ends of a detector column parallel to z [voxels]."""
 WIDE = 8.0
-"""Least width of a unit where it enters the volume [voxels]: a fan reaches at most two voxel
-columns beyond its own lines, its neighbour but one likewise."""
+"""Least width of a unit where it enters the volume [voxels]. A fan reaches at most two
+voxel columns beyond its own lines, and so does its second neighbour."""
 
 
 def lying(views: FloatArray, shape: tuple[int, int]) -> npt.NDArray[np.bool_]:
-    """Views in which images of vertical planes run along the rows more than along the columns.
+    """Find views in which images of vertical planes follow the rows more than the
+    columns.
 
     Args:
         views: (n, 12) source, first pixel minus source, u, v in voxel units.
         shape: detector (rows, cols).
+
+    Returns:
+        (n,) bool.
     """
     rows, cols = shape
     first, u, v = (views[:, i : i + 3] for i in (3, 6, 9))
@@ -65,7 +71,7 @@ def lying(views: FloatArray, shape: tuple[int, int]) -> npt.NDArray[np.bool_]:
 
 
 def exchanged(views: FloatArray) -> FloatArray:
-    """The same rays with rows taken for columns."""
+    """Return the same rays with rows and columns exchanged."""
     return np.ascontiguousarray(views[:, EXCHANGED])
 
 
@@ -88,7 +94,9 @@ class FanPlan:
     alone: IntArray
 
     def fans(self, views: FloatArray, some: slice = slice(None)) -> Fans:
-        """The plan of `views` (n, 12), or `some` of its jobs, as the kernels take it."""
+        """Return the plan of `views` (n, 12), or `some` of its jobs, as the kernels'
+        `Fans`.
+        """
         return Fans(views, self.lines, self.jobs[some], self.room, self.widest)
 
 
@@ -129,7 +137,7 @@ def plan_fans(views: FloatArray, counts: tuple[int, int, int], shape: tuple[int,
 
 
 def _level(chosen: IntArray, shape: tuple[int, int]) -> FanPlan:
-    """Views with detector columns parallel to z: each column is a fan, the same in all views."""
+    """Plan views with detector columns parallel to z: each column is a fan, in all views."""
     rows, cols = shape
     edges = np.arange(cols + 1) - 0.5
     starts = np.arange(0, cols, FANS)
@@ -148,7 +156,16 @@ def _tilted(
     counts: tuple[int, int, int],
     shape: tuple[int, int],
 ) -> FanPlan:
-    """Fans between images of vertical planes, for those of `chosen` that can have them."""
+    """Plan fans between images of vertical planes for the `chosen` views that can have
+    them.
+
+    Args:
+        chosen: indices of views.
+        views: (n, 12) in voxel units of the box.
+        corners: rays to the detector's corners.
+        counts: (nx, ny, nz) voxels of the box.
+        shape: detector (rows, cols).
+    """
     rows, cols = shape
     first, u, v = (views[:, i : i + 3] for i in (3, 6, 9))
     middle = corners.mean(axis=1)
@@ -193,7 +210,9 @@ def _tilted(
 
 
 def _counted(counts: IntArray) -> tuple[IntArray, IntArray]:
-    """For counts (2, 3): (0, 0, 1, 1, 1) and (0, 1, 0, 1, 2)."""
+    """Expand counts to owners and positions: (2, 3) gives (0, 0, 1, 1, 1) and (0, 1, 0,
+    1, 2).
+    """
     group = np.repeat(np.arange(len(counts)), counts)
     starts = np.cumsum(counts) - counts
     return group, np.arange(len(group)) - starts[group]
@@ -202,7 +221,7 @@ def _counted(counts: IntArray) -> tuple[IntArray, IntArray]:
 def _step(
     source: FloatArray, u: FloatArray, rays: FloatArray, counts: tuple[int, int, int]
 ) -> FloatArray:
-    """Columns a fan may span so that its rays stay within SPREAD voxels of each other."""
+    """Compute the columns a fan may span so that its rays stay within SPREAD voxels."""
     ends = np.array([[x, y] for x in (0, counts[0]) for y in (0, counts[1])], dtype=np.float64)
     far = np.linalg.norm(ends - source[:, None, :2], axis=2).max(axis=1)
     turn = np.abs(_cross(rays, u[:, None])) / np.einsum("nki,nki->nk", rays[..., :2], rays[..., :2])
@@ -214,12 +233,12 @@ def _step(
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """z component of a x b."""
+    """Compute the z component of a x b."""
     return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
 
 
 def _widths(gap: FloatArray, rows: int) -> FloatArray:
-    """Largest |a + b r| over the rows."""
+    """Compute the largest |a + b r| over the rows."""
     return np.maximum(np.abs(gap[:, 0]), np.abs(gap[:, 0] + gap[:, 1] * (rows - 1)))
 
 
@@ -245,7 +264,7 @@ def plan_turns(
     shape: tuple[int, int],
     workers: int,
 ) -> Turns:
-    """Order the jobs of a plan.
+    """Order the jobs of a plan so that threads never add to the same voxel at a time.
 
     Args:
         plan: of these views.
@@ -285,7 +304,9 @@ def plan_turns(
 
 
 def _cuts(width: FloatArray) -> list[int]:
-    """Ends of runs of jobs that are at least WIDE wide; a remainder joins the last run."""
+    """List ends of runs of jobs that are at least WIDE wide; a remainder joins the last
+    run.
+    """
     cuts, gathered = [0], 0.0
     for i, w in enumerate(width.tolist()):
         gathered += w
@@ -301,7 +322,7 @@ def _cuts(width: FloatArray) -> list[int]:
 def _image_widths(
     plan: FanPlan, views: FloatArray, counts: tuple[int, int, int], shape: tuple[int, int]
 ) -> FloatArray:
-    """How wide each job is where the box is nearest to the source [voxels], (k,)."""
+    """Compute each job's width where the box is nearest to the source [voxels], (k,)."""
     view, first, last = plan.jobs.T
     r = (shape[0] - 1) / 2
     of = views[view]

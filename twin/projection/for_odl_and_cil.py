@@ -1,8 +1,9 @@
-"""Projector and adjoint as operators of ODL (Operator Discretization Library) and of CIL (Core
-Imaging Library). Neither is imported before an operator of it is asked for.
+"""Projector and adjoint as operators of ODL (Operator Discretization Library) and of CIL
+(Core Imaging Library). Both libraries are imported only when one of their operators is
+made.
 
-CIL's geometries give shapes and voxel sizes to its algorithms; where source and panel are, the
-projector knows by itself.
+CIL's geometries give shapes and voxel sizes to its algorithms; where source and panel
+are, the projector knows by itself.
 """
 
 from __future__ import annotations
@@ -23,12 +24,17 @@ _Map = Callable[[npt.NDArray[Any]], Float32Array]
 def odl_operator(
     project: _Map, spread: _Map, like: Volume, image_shape: tuple[int, int, int]
 ) -> Any:
-    """An `odl.Operator` from functions on a box in mm, axes (z, y, x), to arrays of projections.
+    """Wrap projector and transpose as an `odl.Operator`.
+
+    It maps functions on a box in mm, axes (z, y, x), to arrays of projections.
 
     Args:
         project, spread: projector and transpose.
         like: the grid.
         image_shape: (n, rows, cols).
+
+    Returns:
+        An `odl.Operator` with its adjoint.
     """
     import odl
 

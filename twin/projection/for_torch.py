@@ -155,12 +155,14 @@ def _cone_vec(rows: Any) -> ConeVec:
 
 
 def _memory(one: Any) -> Any:
-    """A tensor as numpy's or numba's array, which shares its memory."""
+    """View a tensor as numpy's or numba's array, which shares its memory."""
     return gpu.taken(one.contiguous()) if _is_there(one) else one.numpy()
 
 
 def _volume(one: Any, like: Volume) -> Volume | DeviceVolume:
-    """Voxels (nz, ny, nx); on a device they share the tensor's memory if z is contiguous."""
+    """Wrap voxels (nz, ny, nx); on a device they share the tensor's memory if z is
+    contiguous.
+    """
     if not _is_there(one):
         return like.like(one.numpy())
     columns = one.permute(1, 2, 0)
@@ -173,14 +175,16 @@ def _volume(one: Any, like: Volume) -> Volume | DeviceVolume:
 
 
 def _voxels(volume: Volume | DeviceVolume) -> Any:
-    """What `back` gave, in C order where it is numpy's."""
+    """Return the voxels of a result of `back`, in C order if they are numpy's."""
     return volume if isinstance(volume, DeviceVolume) else np.array(volume.data, order="C")
 
 
 def _each(function: Callable[[Any], Any], values: Any, shape: tuple[int, int, int]) -> Any:
-    """A function of a tensor of three dimensions for each member of a batch, on its device.
+    """Apply a function of a three-dimensional tensor to each member of a batch, on its
+    device.
 
-    PyTorch's streams and the kernels' own know nothing of each other: each waits for the other.
+    Before and after, it waits for PyTorch's streams and for the kernels' own, which do
+    not know each other.
     """
     batch, device = values.shape[:-3], values.device
     members = values.detach().to(torch.float32).reshape(-1, *values.shape[-3:])

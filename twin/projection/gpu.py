@@ -33,27 +33,29 @@ DRIVERS = {"win32": "nvcuda.dll"}
 CHUNK_BYTES = 256 * 2**20
 """Images on the device at a time."""
 SPARE_BYTES = 256 * 2**20
-"""What must stay free on a device: for the driver, and for whoever else uses it."""
+"""Memory left free on a device for the driver and for other programs [bytes]."""
 VIEWS_A_THREAD = 7 / 16
-"""A volume of the host is worth its way to the device and back from so many views on, for each
-thread of the processor (measured: about 7 views beside 16 threads)."""
+"""Views per thread of the processor from which on moving a volume to the device pays
+(measured: about 7 views against 16 threads)."""
 WORTH_BYTES = 64 * 2**20
-"""A smaller volume is not moved for single views: the processor takes no longer for one than a call
-of the device does (an H200 beside 16 threads: C1, 76 MB, 1.95 and 1.8 ms)."""
+"""Smallest volume that is moved to the device for single views [bytes]. For a smaller
+one the processor is as fast (an H200 against 16 threads: C1, 76 MB, 1.95 and 1.8 ms)."""
 SIDE = 2**14
-"""Voxels along an axis: in longer boxes single precision does not place where a ray enters and
-leaves within the margin of the slab walk."""
+"""Largest number of voxels along an axis for the slab walk. In longer boxes single
+precision does not locate the ends of a ray in the box within the margin of the slab
+walk."""
 NEAR = 1e-9
-"""A box this near to the source or the detector's plane, of their distance, is not clear of it."""
+"""Least distance of a box from source and detector plane, as a share of their
+distance."""
 KINDS = 3
-"""Kinds of walks: ray by ray, by slabs, by slabs in upright columns."""
+"""Number of kinds of walks: single rays, slabs, slabs with upright columns."""
 LINEAR = 256
-"""Threads a block where each has one number."""
+"""Threads a block in kernels that treat one number a thread."""
 LOGGER = logging.getLogger("flexdt")
 
 
 class DeviceError(TwinError):
-    """The device failed; what it was to do may be begun anew on the processor."""
+    """The device failed; the processor may repeat the work."""
 
 
 @dataclass(frozen=True)
@@ -65,19 +67,20 @@ class Availability:
 
 
 _failed: list[Availability] = []
-"""What the device failed of, once it has."""
+"""The failure for which the device was given up, if any."""
 
 
 def availability() -> Availability:
-    """Whether projections can run on a CUDA device; probed once, never raises.
+    """Return whether projections can run on a CUDA device; probed once, never raises.
 
-    NUMBA_DISABLE_CUDA=1 in the environment answers no.
+    With NUMBA_DISABLE_CUDA=1 in the environment no device is available.
     """
     return _failed[0] if _failed else _probed()
 
 
 @cache
 def _probed() -> Availability:
+    """Look for the driver, import numba's CUDA and project one ray on the device."""
     from numba import config
 
     if not config.ENABLE_CUDASIM:
@@ -112,10 +115,12 @@ def leave_after_fork() -> None:
 
 
 def _project_one_ray() -> None:
-    """A ray along x through two voxels of 0.5 mm. One kernel: each takes seconds to compile.
+    """Project a ray along x through two voxels of 0.5 mm and check the result.
+
+    It uses one kernel, because each takes seconds to compile.
 
     Raises:
-        Exception: whatever numba or the driver meets, or a wrong number.
+        Exception: any error of numba or the driver, or a wrong result.
     """
     box = Box(np.array([1, 3], np.float32), None, 0, 1, 2, 2, 1, 1, 0.5, 0.5, 0.5)
     views = np.array([[-1.0, 0.5, 0.5, 4.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0]])
@@ -127,7 +132,7 @@ def _project_one_ray() -> None:
 
 @contextmanager
 def switched_off() -> Iterator[None]:
-    """The processor computes meanwhile."""
+    """Compute on the processor within the context."""
     _failed.insert(0, Availability(False, "switched off"))
     try:
         yield
@@ -136,9 +141,10 @@ def switched_off() -> Iterator[None]:
 
 
 def attempt(work: Callable[[], object]) -> bool:
-    """Whether the device did some work; where it fails, the caller turns to the processor.
+    """Run some work on the device and return whether it succeeded.
 
-    A device that lacks memory may be asked again; one that fails otherwise is given up for good.
+    If it failed, the caller computes on the processor. A device that lacks memory is
+    tried again later; after any other failure it is not used again.
     """
     try:
         work()
@@ -160,7 +166,7 @@ def upload(flat: Float32Array) -> Any:
 
 
 def free_bytes() -> int | None:
-    """Memory free on the device, 0 where it fails; None where it does not say (the simulator)."""
+    """Return the free memory of the device [bytes]: 0 if it fails, None in the simulator."""
     from numba import config, cuda
 
     if config.ENABLE_CUDASIM:
@@ -175,20 +181,23 @@ def free_bytes() -> int | None:
 
 
 def has_room(needed: int) -> bool:
-    """Whether the device can take `needed` bytes more; True where it does not say."""
+    """Return whether the device can take `needed` more bytes; True if that is unknown."""
     free = free_bytes()
     return free is None or needed + SPARE_BYTES <= free
 
 
 def usable(voxel_bytes: int, images: Float32Array, threads: int, before: int = 0) -> bool:
-    """Whether a device has room for these voxels and for the images of one portion, and pays.
+    """Return whether a device has room for voxels and one portion of images, and pays.
 
     Args:
-        voxel_bytes: that would have to be moved there; 0 for voxels that are there.
+        voxel_bytes: size of the voxels to be moved there; 0 for voxels on the device.
         images: (n, rows, cols).
-        threads: of the processor.
-        before: views of the same voxels that the processor has projected. More are likely: moved
-            once those would have paid for it, a volume takes at most twice the least time.
+        threads: number of threads of the processor.
+        before: number of views of the same voxels that the processor has projected. More
+            are then
+            likely: the volume is moved once these would have paid for it, so that it
+            takes at most
+            twice the least time.
     """
     views = len(images) + (before if voxel_bytes >= WORTH_BYTES else 0)
     if not availability().present or (voxel_bytes and views < VIEWS_A_THREAD * threads):
@@ -198,7 +207,7 @@ def usable(voxel_bytes: int, images: Float32Array, threads: int, before: int = 0
 
 
 def on(device: int) -> Any:
-    """A context in which this device is the one that works."""
+    """Return a context in which this device is the current one."""
     from numba import cuda
 
     return cuda.gpus[device]
@@ -212,7 +221,7 @@ def finish() -> None:
 
 
 def zeros(count: int, kind: Any = np.float32) -> Any:
-    """A flat array of zeros on the device; nothing is moved."""
+    """Create a flat array of zeros on the device; nothing is transferred."""
     from numba import cuda
 
     from flexdt.twin.projection.kernels import gpu_kernels
@@ -223,7 +232,7 @@ def zeros(count: int, kind: Any = np.float32) -> Any:
 
 
 def is_there(x: object) -> bool:
-    """Whether an array is on a CUDA device, of whatever library."""
+    """Return whether an array of any library is on a CUDA device."""
     return hasattr(x, "copy_to_host") or hasattr(x, "__cuda_array_interface__")
 
 
@@ -235,7 +244,7 @@ def check_host(there: bool, what: str) -> None:
 
 
 def taken(x: Any) -> Any:
-    """An array on the device as numba has it; its memory is shared.
+    """Convert an array on the device to numba's array that shares its memory.
 
     Raises:
         GeometryError: it is not float32 in C order.
@@ -250,10 +259,10 @@ def taken(x: Any) -> Any:
 
 
 def demand(work: Callable[[], Any]) -> Any:
-    """What some work on the device returns, for values that are there.
+    """Run some work on values on the device and return its result.
 
     Raises:
-        DeviceError: the device failed; the log says so, too.
+        DeviceError: the device failed; the failure is logged as well.
     """
     found: list[Any] = []
     if not attempt(lambda: found.append(work())):
@@ -262,7 +271,7 @@ def demand(work: Callable[[], Any]) -> Any:
 
 
 def project_there(box: Box, voxels: Any, views: FloatArray, shape: tuple[int, ...]) -> Any:
-    """Images (n, rows, cols) of a volume on the device, which stay there."""
+    """Project a volume on the device to images (n, rows, cols) that stay there."""
     from numba import cuda
 
     images = cuda.device_array(len(views) * shape[0] * shape[1], np.float32)
@@ -286,17 +295,18 @@ def project(box: Box, voxels: Any, views: FloatArray, out: Float32Array) -> None
 def spread_there(
     box: Box, voxels: Any, views: FloatArray, values: Any, *, deterministic: bool = False
 ) -> None:
-    """The transpose of `project`: adds values (n, rows, cols) to voxels on the device.
+    """Apply the transpose of `project`: add values (n, rows, cols) to voxels on the
+    device.
 
-    Rays add in the order in which they come, so that sums differ in their last bits from run to
-    run. Deterministic, they add integers, of which the sum is the same in any order: twice the
-    memory for a volume more.
+    Rays add in the order in which they arrive, so that sums differ in their last bits
+    from run to run. In deterministic mode they add integers, whose sum does not depend on
+    the order, for the memory of two more volumes.
 
     Args:
         box: the volume.
         voxels: its flat array, on the device.
         views: as in `project`.
-        values: of the host, moved in portions, or on the device.
+        values: on the host, moved in portions, or on the device.
         deterministic: add integers.
     """
     from numba import cuda
@@ -325,16 +335,25 @@ def spread(
     clean: bool = False,
     deterministic: bool = False,
 ) -> None:
-    """`spread_there` onto box.flat, of the host; clean: it holds zeros, which are not moved."""
+    """Apply `spread_there` to box.flat on the host.
+
+    Args:
+        box: the volume.
+        views: as in `project`.
+        values: (n, rows, cols) on the host.
+        clean: True if box.flat holds zeros, which are not transferred.
+        deterministic: add integers; see `spread_there`.
+    """
     voxels = zeros(box.flat.size) if clean else upload(box.flat)
     spread_there(box, voxels, views, values, deterministic=deterministic)
     voxels.copy_to_host(box.flat)
 
 
 def whole_factor(box: Box, values: Any) -> float:
-    """The power of 2 by which values are multiplied to be added as integers of 64 bits.
+    """Compute the power of 2 that scales values for a sum of 64-bit integers.
 
-    A ray adds at most its value times a voxel's diagonal; all rays together stay below 2^62.
+    A ray adds at most its value times a voxel's diagonal; the sum of all rays stays below
+    2^62.
     """
     diagonal = math.hypot(box.size_x, box.size_y, box.size_z)
     values = values.copy_to_host() if is_there(values) else values
@@ -343,11 +362,12 @@ def whole_factor(box: Box, values: Any) -> float:
 
 
 def by_slabs(box: Box, views: FloatArray, shape: tuple[int, int]) -> npt.NDArray[np.bool_]:
-    """Views whose rays all cross the whole box, from the source to the pixel, and rise at most one
-    voxel for each that they pass along the faster one of x and y.
+    """Find the views that the slab walk can project, (n,) bool.
 
-    Convex conditions, held by a detector's corners and so by all its pixels; a view that fails may
-    still have only such rays.
+    All rays of such a view cross the box from side to side between source and pixel, and
+    rise at most one voxel for each that they pass along the faster one of x and y. These
+    are convex conditions: if the detector's corners meet them, all pixels do. A view that
+    fails may still have only such rays.
     """
     return clear_of(box, views, shape) & (rises(views, shape) <= 1.0)
 
@@ -369,8 +389,13 @@ def rises(views: FloatArray, shape: tuple[int, int]) -> FloatArray:
 
 
 def clear_of(box: Box, views: FloatArray, shape: tuple[int, int]) -> npt.NDArray[np.bool_]:
-    """Views whose source lies before a box and whose detector's plane lies behind it, of boxes that
-    the slab walk can place rays in."""
+    """Find the views whose source is before a box and whose detector plane is behind it.
+
+    Boxes too long for the slab walk have no such views.
+
+    Returns:
+        (n,) bool.
+    """
     counts = (box.nx, box.ny, box.nz)
     if max(counts) >= SIDE or (box.flat is not None and box.flat.size >= 2**31):
         return np.zeros(len(views), np.bool_)
@@ -392,7 +417,7 @@ def clear_of(box: Box, views: FloatArray, shape: tuple[int, int]) -> npt.NDArray
 
 
 def _corners(views: FloatArray, shape: tuple[int, int]) -> FloatArray:
-    """Corner pixels of the detector minus the source, (n, 4, 3)."""
+    """Compute corner pixels of the detector minus the source, (n, 4, 3)."""
     rows, cols = shape
     first, u, v = (views[:, None, i : i + 3] for i in (3, 6, 9))
     ends = np.array([[c, r] for c in (0.0, cols - 1.0) for r in (0.0, rows - 1.0)])
@@ -413,7 +438,7 @@ def launcher(
     transposed: bool,
     factor: float = 1.0,
 ) -> Callable[[], None]:
-    """What runs the kernels that these views want, each on all of its views at once.
+    """Prepare the kernels for these views; return a function that launches them.
 
     images: flat, on the device. One array goes there: views by kernel, each with the number of its
     image. Views of a detector on its side take its columns for rows, so that lanes are neighbours
@@ -454,6 +479,6 @@ def launcher(
 
 
 def _chunks(images: Float32Array) -> list[slice]:
-    """Views in portions that fit a device."""
+    """Cut views into slices whose images fit into CHUNK_BYTES."""
     count = max(1, CHUNK_BYTES // max(1, images[:1].nbytes))
     return [slice(i, i + count) for i in range(0, len(images), count)]

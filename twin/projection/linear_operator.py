@@ -40,16 +40,16 @@ if TYPE_CHECKING:
     from flexdt.twin.projection.for_torch import TorchOperator
 
 HOST = 1
-"""DLPack's number for the processor's memory."""
+"""DLPack's number of the processor's memory."""
 SMALLEST_TOLERANCE = 1e-5
-"""Of a norm: images and voxels are single precision."""
+"""Smallest relative tolerance of a norm: images and voxels are single precision."""
 
 
 def on_host(function: Callable[[npt.NDArray[Any]], Float32Array]) -> Callable[[Any], Any]:
-    """A function of a numpy array for arrays of any library.
+    """Wrap a function of a numpy array for arrays of any library.
 
-    Anything that numpy itself can read gives a numpy array. Of other arrays the memory is shared by
-    DLPack, and the result is handed to `from_dlpack` of the array's own library.
+    An array that numpy can read gives a numpy array. The memory of any other array is
+    shared by DLPack, and the result goes to `from_dlpack` of the array's own library.
 
     Raises:
         NotBuiltError: the array is in the memory of a device.
@@ -65,7 +65,7 @@ def on_host(function: Callable[[npt.NDArray[Any]], Float32Array]) -> Callable[[A
 
 
 def _library(x: Any) -> Any:
-    """The module with the functions for an array, as the array API standard has it."""
+    """Return the module with the functions for an array, by the array API standard."""
     if hasattr(x, "__array_namespace__"):
         return x.__array_namespace__()
     return sys.modules[type(x).__module__.partition(".")[0]]
@@ -120,12 +120,12 @@ class Operator:
 
     @property
     def voxel_shape(self) -> tuple[int, int, int]:
-        """(nz, ny, nx) of what it takes."""
+        """Shape of the input, (nz, ny, nx)."""
         return self.like.shape
 
     @property
     def image_shape(self) -> tuple[int, int, int]:
-        """(n, rows, cols) of what it gives."""
+        """Shape of the result, (n, rows, cols)."""
         return len(self.geometry), *self.detector_shape
 
     @property
@@ -134,8 +134,10 @@ class Operator:
         return Adjoint(self)
 
     def __matmul__(self, x: Any) -> Any:
-        """Line integrals (n, rows, cols) of voxels (nz, ny, nx) [1/mm], or of a `Volume`; of a
-        `DeviceVolume`, on the device.
+        """Compute line integrals (n, rows, cols) of voxels (nz, ny, nx) [1/mm] or of a
+        volume.
+
+        Those of a `DeviceVolume` stay on the device.
         """
         if isinstance(x, (Volume, DeviceVolume)):
             if not _same_grid(x, self.like):
@@ -163,11 +165,13 @@ class Operator:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns of the matrix: what `scipy.sparse.linalg.aslinearoperator` asks for."""
+        """Rows and columns of the matrix, as `scipy.sparse.linalg.aslinearoperator` needs
+        them.
+        """
         return math.prod(self.image_shape), math.prod(self.voxel_shape)
 
     def matvec(self, x: npt.NDArray[Any]) -> Float32Array:
-        """Line integrals of voxels, flat both (C order).
+        """Compute line integrals of voxels, flat both (C order).
 
         Example:
             >>> view = ConeVec.from_vectors((0, -500, 0), (0, 500, 0), (1, 0, 0), (0, 0, -1))
@@ -177,7 +181,7 @@ class Operator:
         return self._forward(x.reshape(self.voxel_shape)).ravel()
 
     def rmatvec(self, y: npt.NDArray[Any]) -> Float32Array:
-        """Voxels of projections by the transpose, flat both (C order).
+        """Apply the transpose to projections, flat both (C order).
 
         Example:
             >>> view = ConeVec.from_vectors((0, -500, 0), (0, 500, 0), (1, 0, 0), (0, 0, -1))
@@ -187,17 +191,18 @@ class Operator:
         return self._back(y.reshape(self.image_shape)).ravel()
 
     def norm(self, tolerance: float = 1e-3) -> float:
-        """The largest singular value [mm], by the power method.
+        """Compute the largest singular value [mm] by the power method.
 
-        Lengths are never negative, so that the iteration from all ones leads to the largest one. It
-        ends when an eigenvalue of A' A is certain to lie within twice the tolerance of its estimate
-        (the residual says so); the estimate is never above the true value, but for rounding.
+        Lengths are never negative, so that the iteration from all ones leads to the
+        largest one. It ends when an eigenvalue of A' A is certain to be within twice the
+        tolerance of its estimate (by the residual); the estimate is never above the true
+        value, except for rounding.
 
         Args:
             tolerance: relative, at least 1e-5.
 
         Raises:
-            LimitError: another tolerance.
+            LimitError: the tolerance is below 1e-5.
 
         Example:
             >>> view = ConeVec.from_vectors((0, -500, 0), (0, 500, 0), (1, 0, 0), (0, 0, -1))
@@ -211,7 +216,8 @@ class Operator:
         return norm_of(self._forward, self._back, np.ones(self.voxel_shape, np.float32), tolerance)
 
     def gradient(self, x: Volume | npt.ArrayLike, weights: npt.ArrayLike) -> FloatArray:
-        """Derivative of sum(weights * (A @ x)) with respect to the geometry, (n, 12) [1/mm].
+        """Compute the derivative of sum(weights * (A @ x)) by the geometry, (n, 12)
+        [1/mm].
 
         See `flexdt.twin.projection.operators`.
 
@@ -224,7 +230,8 @@ class Operator:
         return geometry_gradient(self._volume(x), self.geometry, weights)
 
     def change(self, x: Volume | npt.ArrayLike, change: npt.ArrayLike) -> Float32Array:
-        """Derivative of A @ x along a change (n, 12) of the geometry, (n, rows, cols).
+        """Compute the derivative of A @ x along a change (n, 12) of the geometry, (n,
+        rows, cols).
 
         See `flexdt.twin.projection.geometry_change`.
 
@@ -240,7 +247,8 @@ class Operator:
         return x if isinstance(x, Volume) else self.like.like(np.asarray(x))
 
     def linear_operator(self) -> Any:
-        """The same as a `scipy.sparse.linalg.LinearOperator` on flat vectors (C order).
+        """Return the map as a `scipy.sparse.linalg.LinearOperator` on flat vectors (C
+        order).
 
         Example:
             >>> view = ConeVec.from_vectors((0, -500, 0), (0, 500, 0), (1, 0, 0), (0, 0, -1))
@@ -253,7 +261,7 @@ class Operator:
         return aslinearoperator(self)
 
     def torch(self) -> TorchOperator:
-        """The same for PyTorch tensors, with gradients with respect to voxels and geometry.
+        """Return the map for PyTorch tensors, with gradients by voxels and geometry.
 
         Needs the extra `torch`. See `flexdt.twin.projection.for_torch.TorchOperator`.
 
@@ -270,7 +278,8 @@ class Operator:
         return TorchOperator(self.geometry, self.like, self.detector_shape)
 
     def odl(self) -> Any:
-        """The same as an `odl.Operator`, from a discretised function space in mm (z, y, x).
+        """Return the map as an `odl.Operator`, from a discretised function space in mm
+        (z, y, x).
 
         Needs the extra `odl`. Both spaces have the weight 1, so that ODL's adjoint is the
         transpose.
@@ -284,10 +293,12 @@ class Operator:
         return odl_operator(self._forward, self._back, self.like, self.image_shape)
 
     def cil(self) -> Any:
-        """The same as a `LinearOperator` of CIL, with geometries that describe voxels and panel.
+        """Return the map as a `LinearOperator` of CIL, with CIL geometries of voxels and
+        panel.
 
-        CIL's algorithms, its power method and its dot test were run on it with CIL 26.0. CIL's
-        geometry has the distances and sizes for CIL's displays; the rays are this operator's.
+        CIL's algorithms, its power method and its dot test were run on it with CIL 26.0.
+        CIL's geometry has the distances and sizes for CIL's displays; the rays are this
+        operator's.
 
         Raises:
             TwinError: CIL is not installed.
@@ -320,8 +331,10 @@ class Adjoint:
         return f"{self.T!r}.T"
 
     def __matmul__(self, y: Any) -> Any:
-        """Voxels (nz, ny, nx) from projections (n, rows, cols); of an array on a CUDA device (but
-        no tensor), a `DeviceVolume`.
+        """Apply the transpose to projections (n, rows, cols); returns voxels (nz, ny,
+        nx).
+
+        An array on a CUDA device (but no tensor) gives a `DeviceVolume`.
         """
         if not _is_tensor(y) and gpu.is_there(y):
             _check(tuple(y.shape), self.T.image_shape, "projections")
@@ -332,7 +345,7 @@ class Adjoint:
 
 
 def _is_tensor(x: object) -> bool:
-    """Whether it is a PyTorch tensor; PyTorch is not imported to find out."""
+    """Return whether x is a PyTorch tensor, without importing PyTorch."""
     torch = sys.modules.get("torch")
     return torch is not None and isinstance(x, torch.Tensor)
 
@@ -352,7 +365,7 @@ def _same_grid(a: Volume | DeviceVolume, b: Volume) -> bool:
 
 @singledispatch
 def dot(a: Any, b: Any) -> float:
-    """Inner product of two arrays of one shape, summed in double precision."""
+    """Compute the inner product of two arrays of one shape in double precision."""
     axes = [*range(a.ndim)]
     return float(np.einsum(a, axes, b, axes, [], dtype=np.float64))
 
@@ -363,7 +376,16 @@ dot.register(DeviceArray, DeviceArray.dot)
 def norm_of(
     project: Callable[[Any], Any], spread: Callable[[Any], Any], ones: Any, tolerance: float
 ) -> float:
-    """`Operator.norm` of a map and its transpose, from an array of ones, of numpy or a device."""
+    """Compute `Operator.norm` of a map and its transpose.
+
+    Args:
+        project, spread: the map and its transpose.
+        ones: array of ones, of numpy or on a device, from which the iteration starts.
+        tolerance: relative.
+
+    Returns:
+        The largest singular value.
+    """
     x = ones
     while True:
         x = x * np.float32(1.0 / np.sqrt(dot(x, x)))

@@ -61,23 +61,24 @@ Order = tuple[int, int, int]
 ORDERS: tuple[Order, Order, Order] = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
 """Axes of the volume that take the places of x, y and z: levels along z, x and y."""
 NO_FANS = 3
-"""Beside the indices into ORDERS: fans would hold so few rays that each is faster on its own."""
+"""Code of single rays, after the indices into ORDERS: fans would hold too few rays to
+pay."""
 CROSSING, LEVEL, SLAB = (10.5, 15.5), (0.1, 1.0), 35.0
-"""Time of a ray of a fan at a level, and of a fan in a slab: of each level there, and beside them
-[ns]. Pairs: fans of rays in one plane, and others."""
+"""Time of a ray of a fan at a level, of a fan in a slab at each level, and of a fan in
+a slab apart from its levels [ns]. Pairs: fans of rays in one plane, and others."""
 ALONE, VIEW = 2.75, 5e5
-"""Time of a ray on its own at a voxel, and of planning the fans of a view [ns]. All of these were
-fitted to drawn geometries, each timed all four ways (`tests/studies/walks.py`), on two busy cores;
-only their ratios count."""
+"""Time of a single ray at a voxel, and of planning the fans of a view [ns]. All of
+these were fitted to drawn geometries, each timed all four ways
+(`tests/studies/walks.py`), on two busy cores; only their ratios count."""
 PREFERRED = 0.75
-"""Another axis takes less than this share of the time, or is not worth another layout."""
+"""Largest share of the time that another axis may take to be worth another layout."""
 ON_ALL_CORES = 16 * 2**20
-"""Bytes of projections from which all cores look at them together."""
+"""Size of projections from which on all cores check them together [bytes]."""
 Shape2 = tuple[int, int]
 
 
 def in_order(geometry: ConeVec, order: Order) -> ConeVec:
-    """The geometry of `Volume.in_order`; the images are the same."""
+    """Return the geometry for `Volume.in_order`; the images are the same."""
     if order == ORDERS[0]:
         return geometry
     rows = geometry.rows.reshape(-1, 4, 3)[:, :, list(order)].reshape(-1, 12)
@@ -87,8 +88,11 @@ def in_order(geometry: ConeVec, order: Order) -> ConeVec:
 def by_level_axis(
     volume: Volume, geometry: ConeVec, shape: tuple[int, int]
 ) -> Iterator[tuple[slice, Order, bool]]:
-    """Ranges of neighbouring views, each with the volume's order to project them in, and whether
-    in fans.
+    """Yield ranges of neighbouring views with the best axis to stack levels along.
+
+    Returns:
+        Tuples of the range, the volume's order for projecting it, and whether rays travel
+            in fans.
     """
     rays = geometry.rays(shape)
     rays[:, :3] -= volume.center_mm
@@ -102,10 +106,11 @@ def by_level_axis(
 def level_axes(
     rays: FloatArray, counts: tuple[int, int, int], shape: tuple[int, int]
 ) -> npt.NDArray[np.intp]:
-    """Index into ORDERS of each view, or NO_FANS.
+    """Choose an index into ORDERS for each view, or NO_FANS, by estimated time.
 
     Args:
-        rays: (n, 12) source relative to the volume's centre, first pixel minus source, u, v in
+        rays: (n, 12) source relative to the volume's centre, first pixel minus source, u,
+            v in
             voxel units.
         counts: (nz, ny, nx) voxels.
         shape: detector (rows, cols).
@@ -151,10 +156,12 @@ def forward(
     shape: Shape2 | None = None,
     out: Float32Array | None = None,
 ) -> Float32Array:
-    """Line integrals of a volume: exact path length times value, summed over voxels (Siddon 1985).
+    """Compute line integrals of a volume: path length times value over voxels (Siddon
+    1985).
 
     Args:
-        volume: attenuation [1/mm], as Volume(data, voxel_mm). Of a `DeviceVolume`, the images stay
+        volume: attenuation [1/mm], as Volume(data, voxel_mm). Of a `DeviceVolume`, the
+            images stay
             on the device.
         cone_vec: ConeVec or (n, 12) [mm], object frame; any orientation of the detector.
         shape: detector (rows, cols); default: the geometry's own.
@@ -203,7 +210,7 @@ def forward(
 
 
 def _on_device(volume: Volume, geometry: ConeVec, shape: Shape2, out: Float32Array) -> bool:
-    """Whether a CUDA device has filled `out`."""
+    """Try to fill `out` on a CUDA device and return whether that succeeded."""
     if not gpu.availability().present or len(geometry) == 0 or volume.layout.empty:
         return False
     layout = volume.layout
@@ -225,27 +232,31 @@ def back(
     *,
     deterministic: bool = False,
 ) -> Volume:
-    """The exact adjoint of `forward`: <forward(x), y> = <x, back(y)>.
+    """Apply the exact adjoint of `forward`: <forward(x), y> = <x, back(y)>.
 
-    The result's data is a (nz, ny, nx) view with z contiguous in memory, which `forward` reads
-    without another copy; use np.ascontiguousarray where C order matters.
+    The result's data is a (nz, ny, nx) view with z contiguous in memory, which `forward`
+    reads without another copy; use np.ascontiguousarray where C order matters.
 
     Args:
         projections: (n, rows, cols); of the host, or on a CUDA device (anything with
             `__cuda_array_interface__`), where the result stays then.
         cone_vec: ConeVec or (n, 12) [mm], one row a projection.
         like: the grid, or a volume on it, whose values are not used.
-        out: an array of `room_like(like)`, overwritten and taken for the result if given: new
+        out: an array of `room_like(like)`, overwritten and taken for the result if given:
+            new
             memory costs as much as half the work of one view.
-        deterministic: on a CUDA device, where rays add to voxels as they come, sums whose bytes are
+        deterministic: on a CUDA device, where rays add to voxels as they come, sums whose
+            bytes are
             equal at every run, for three times the memory; the processor's always are.
 
     Returns:
-        Volume (of images on a device: `DeviceVolume`) on the grid of `like`; values in the unit of
+        Volume (of images on a device: `DeviceVolume`) on the grid of `like`; values in
+            the unit of
         projections times mm.
 
     Raises:
-        GeometryError: the number of projections is not that of the views, out does not fit, or a
+        GeometryError: the number of projections is not that of the views, out does not
+            fit, or a
             row gives its pixels no rays of their own.
 
     Examples:
@@ -296,9 +307,10 @@ def back(
 def _spread(
     like: Volume, layout: Layout, geometry: ConeVec, values: Float32Array, *, clean: bool
 ) -> None:
-    """`back` on the processor, into a layout that holds zeros (clean) or anything.
+    """Apply `back` on the processor, into a layout that holds zeros (clean) or anything.
 
-    Views whose levels are along x or y are gathered in a volume of that order, which is added last.
+    Views with levels along x or y are summed in a volume of that order, which is added
+    last.
     """
     from flexdt.twin.projection.kernels import layout_kernels
 
@@ -323,14 +335,14 @@ def _spread(
 
 
 def corners_of(volume: Volume | DeviceVolume) -> FloatArray:
-    """The corners of a volume's box, (8, 3) [mm]."""
+    """Compute the corners of a volume's box, (8, 3) [mm]."""
     half = 0.5 * np.array(volume.shape[::-1]) * volume.voxel_xyz
     signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
     return np.asarray(volume.center_mm + signs * half)
 
 
 def box_of(layout: Layout) -> Box:
-    """A layout as the kernels take it."""
+    """Convert a layout to the kernels' `Box`."""
     return Box(
         layout.flat,
         layout.spans,
@@ -343,7 +355,7 @@ def box_of(layout: Layout) -> Box:
 
 
 def layout_data(layout: Layout) -> Float32Array:
-    """The voxels of a layout as a (nz, ny, nx) view."""
+    """View the voxels of a layout as (nz, ny, nx)."""
     nx, ny, nz = layout.counts
     size = layout.flat.itemsize
     return np.lib.stride_tricks.as_strided(
@@ -354,8 +366,11 @@ def layout_data(layout: Layout) -> Float32Array:
 
 
 def check_projections(projections: npt.ArrayLike, n: int) -> Any:
-    """Projections as C-ordered float32 (n, rows, cols), or GeometryError; on a device, as they are
+    """Convert projections to C-ordered float32 (n, rows, cols); those on a device stay
     there.
+
+    Raises:
+        GeometryError: they are no `n` images.
     """
     if gpu.is_there(projections):
         values = gpu.taken(projections)
@@ -384,9 +399,10 @@ def require_finite(values: Any) -> None:
 
 
 def voxel_rays(cone_vec: ConeVec, layout: Layout, shape: Shape2) -> FloatArray:
-    """`ConeVec.rays` in voxel units.
+    """Convert `ConeVec.rays` to voxel units.
 
-    The unit is the voxel's edge along each axis, the origin the low corner of the occupied box.
+    The unit is the voxel's edge along each axis, the origin the low corner of the
+    occupied box.
     """
     rays = cone_vec.rays(shape)
     rays[:, 0:3] -= np.array(layout.low_mm)
@@ -394,7 +410,7 @@ def voxel_rays(cone_vec: ConeVec, layout: Layout, shape: Shape2) -> FloatArray:
 
 
 def _are_finite(values: npt.NDArray[Any]) -> bool:
-    """Whether all numbers are finite, looked at by all cores where they are many."""
+    """Return whether all numbers are finite; many numbers are checked on all cores."""
     if values.nbytes < ON_ALL_CORES or values.dtype != np.float32 or not values.flags.c_contiguous:
         return math.isfinite(float(values.sum()))
     from flexdt.twin.projection.kernels import layout_kernels
@@ -403,13 +419,22 @@ def _are_finite(values: npt.NDArray[Any]) -> bool:
 
 
 def as_cone_vec(cone_vec: ConeVec | npt.ArrayLike) -> ConeVec:
-    """cone_vec, (n, 12) [mm], with a ray for each pixel, or GeometryError naming the row."""
+    """Check that each pixel of cone_vec, (n, 12) [mm], has its own ray, and return a
+    ConeVec.
+
+    Raises:
+        GeometryError: a row does not; it is named.
+    """
     given = cone_vec if isinstance(cone_vec, ConeVec) else ConeVec(as_numbers("cone_vec", cone_vec))
     return check_spread(given)
 
 
 def check_out(out: Float32Array | None, shape: tuple[int, int, int]) -> Float32Array:
-    """`out` if it fits, a new array if it is None, or GeometryError."""
+    """Return `out` if it fits, or a new array if it is None.
+
+    Raises:
+        GeometryError: out has another shape, type or memory order.
+    """
     if out is None:
         return np.empty(shape, np.float32)
     if (
@@ -426,16 +451,17 @@ def check_out(out: Float32Array | None, shape: tuple[int, int, int]) -> Float32A
 
 
 JUMPS = 4.0
-"""Time of a ray whose derivatives are gathered, as a multiple of that of its integral."""
+"""Time of a ray whose derivatives are computed, as a multiple of that of its integral."""
 
 
 def geometry_gradient(
     volume: Volume, cone_vec: ConeVec | npt.ArrayLike, weights: npt.ArrayLike
 ) -> FloatArray:
-    """Derivative of sum(weights * forward(volume, cone_vec)) with respect to each row's numbers.
+    """Compute the derivative of sum(weights * forward(volume, cone_vec)) by each row's
+    numbers.
 
-    With `weights` the derivative of a loss with respect to the projections, the result is the
-    derivative of the loss with respect to the geometry.
+    With `weights` the derivative of a loss with respect to the projections, the result is
+    the derivative of the loss with respect to the geometry.
 
     Args:
         volume: attenuation [1/mm].
@@ -443,10 +469,12 @@ def geometry_gradient(
         weights: (n, rows, cols), dimensionless.
 
     Returns:
-        float64 (n, 12) [1/mm]: with respect to source, detector centre, u and v of each view.
+        float64 (n, 12) [1/mm]: with respect to source, detector centre, u and v of each
+            view.
 
     Raises:
-        GeometryError: shapes that do not fit, or a row that gives its pixels no rays of their own.
+        GeometryError: shapes that do not fit, or a row that gives its pixels no rays of
+            their own.
 
     Examples:
         A pixel that moves to the side makes the way through a cube of 2 mm longer, by
@@ -484,21 +512,25 @@ def geometry_change(
     change: npt.ArrayLike,
     shape: Shape2 | None = None,
 ) -> Float32Array:
-    """Derivative of the projections along a change of the geometry: a column of the Jacobian.
+    """Compute the derivative of projections along a geometry change: a column of the
+    Jacobian.
 
-    To first order, forward(volume, rows + step * change) = forward(volume, rows) + step * result.
+    To first order, forward(volume, rows + step * change) = forward(volume, rows) + step *
+    result.
 
     Args:
         volume: attenuation [1/mm].
         cone_vec: ConeVec or (n, 12) [mm], object frame.
-        change: (n, 12) or (12,): for each unit of the parameter, what is added to each row [mm].
+        change: (n, 12) or (12,): for each unit of the parameter, what is added to each
+            row [mm].
         shape: detector (rows, cols); by default the geometry's own.
 
     Returns:
         float32 (n, rows, cols), for each unit of the parameter.
 
     Raises:
-        GeometryError: shapes that do not fit, or a row that gives its pixels no rays of their own.
+        GeometryError: shapes that do not fit, or a row that gives its pixels no rays of
+            their own.
 
     Example:
         >>> from flexdt.twin.geometry.cone_vec import ConeVec

@@ -1,8 +1,9 @@
-"""Work in portions of a fraction of a second, so that Python hears Ctrl-C between two of them.
+"""Cut work into portions of a fraction of a second, between which Python handles Ctrl-C.
 
-A compiled kernel does not return before its work is done. Its jobs are therefore given to it in
-ranges whose estimated time is a quarter of a second. Estimates are of one thread of a present
-processor, in nanoseconds; a portion is at least one job. Results do not depend on portions.
+A compiled kernel does not return before its work is done. Its jobs are therefore given to
+it in ranges whose estimated time is a quarter of a second. Estimates are of one thread of
+a present processor, in nanoseconds; a portion is at least one job. Results do not depend
+on portions.
 """
 
 from __future__ import annotations
@@ -17,32 +18,32 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 IntArray = npt.NDArray[np.int64]
 
 PORTION_NS = 2.5e8
-"""Estimated time of a portion, of all threads together."""
+"""Estimated time of a portion, summed over all threads [ns]."""
 LEVEL_NS = (0.2, 1.5)
-"""A fan at a level of a slab: of a detector whose columns are parallel to z, and of others."""
+"""Time of a fan at a level of a slab [ns]: detector columns parallel to z, and others."""
 CROSSING_NS = 100.0
-"""A ray of a fan: where it crosses levels, its place in the image."""
+"""Time for a ray of a fan to cross levels and to be found in the image [ns]."""
 VOXEL_NS = 4.0
-"""A ray on its own, in each voxel."""
+"""Time of a single ray in one voxel [ns]."""
 PASS_NS = 3.0
-"""A pass over a volume, at each voxel."""
+"""Time of a pass over a volume, per voxel [ns]."""
 
 
 def equal_portions(count: int, job_ns: float, threads: int) -> Iterator[tuple[int, int]]:
-    """Ranges (first, last) of `count` jobs that take `job_ns` each."""
+    """Yield ranges (first, last) of `count` jobs that take `job_ns` each."""
     step = max(1, int(PORTION_NS * threads / max(job_ns, 1e-3)))
     for first in range(0, count, step):
         yield first, min(first + step, count)
 
 
 def layer_portions(volume: Float32Array) -> Iterator[tuple[int, int]]:
-    """Ranges (first, last) of layers of volume (nz, ny, nx) for a pass over it."""
+    """Yield ranges (first, last) of layers of volume (nz, ny, nx) for a pass over it."""
     _, ny, nx = volume.shape
     return equal_portions(len(volume), PASS_NS * ny * nx, 1)
 
 
 def portions(job_ns: FloatArray, threads: int) -> Iterator[tuple[int, int]]:
-    """Ranges (first, last) of jobs whose times are `job_ns` (n,)."""
+    """Yield ranges (first, last) of jobs whose times are `job_ns` (n,)."""
     ends = np.cumsum(job_ns)
     first, most = 0, PORTION_NS * threads
     while first < len(ends):
@@ -53,12 +54,12 @@ def portions(job_ns: FloatArray, threads: int) -> Iterator[tuple[int, int]]:
 
 
 def turn_portions(turns: IntArray, unit_ns: FloatArray, threads: int) -> Iterator[IntArray]:
-    """The rows of `fan_plan.Turns.turns` in portions.
+    """Yield the rows of `fan_plan.Turns.turns` in portions, each (k, 2).
 
     Args:
-        turns: (k, 2) ranges of units, one after the other; the units of a turn may be cut apart.
-        unit_ns: of each unit.
-        threads: that share the work.
+        turns: (k, 2) consecutive ranges of units; a range may be cut between its units.
+        unit_ns: estimated time of each unit [ns].
+        threads: number of threads that share the work.
     """
     for first, last in portions(unit_ns, threads):
         inside = np.clip(turns, first, last)
@@ -66,7 +67,7 @@ def turn_portions(turns: IntArray, unit_ns: FloatArray, threads: int) -> Iterato
 
 
 def ray_ns(counts: tuple[int, int, int]) -> float:
-    """Time of a ray on its own through a box of `counts` voxels."""
+    """Estimate the time of a single ray through a box of `counts` voxels [ns]."""
     return VOXEL_NS * sum(counts)
 
 
@@ -77,7 +78,7 @@ def fan_job_ns(
     counts: tuple[int, int, int],
     pixels: tuple[int, int],
 ) -> FloatArray:
-    """Times of the jobs of a plan (k,).
+    """Estimate the times of the jobs of a plan [ns], (k,).
 
     Args:
         lines: (m, 2) fan boundaries c = a + b r.

@@ -26,8 +26,8 @@ from flexdt.twin.projection.portions import PASS_NS, equal_portions
 from flexdt.twin.signatures import File, public
 
 WARNED: Final = 0.03
-"""Relative bound from which on a warning tells of it, where a tenth of the uniform regions have
-more. The bound is two to four times what is off: about 1 %."""
+"""Relative bound from which on `Accuracy.warnings` warns if a tenth of the uniform
+regions exceed it. The bound is two to four times the actual deviation: about 1 %."""
 CAUSES: Final = {
     "angles": "missing or few views",
     "aside": "the narrow overlap of an offset panel",
@@ -47,7 +47,8 @@ NOT_BOUNDED: Final = (
 Vector3 = tuple[float, float, float]
 IntArray = npt.NDArray[np.int32]
 LANES = 16
-"""Voxel columns start at multiples of this many floats: one cache line, one wide register."""
+"""Voxel columns start at multiples of this many floats: one cache line, one wide
+register."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,9 @@ class Accuracy:
 
     @property
     def warnings(self) -> list[str]:
-        """A warning where a tenth of the regions may be off by more than some per cent."""
+        """A warning if a tenth of the regions may deviate by more than some per cent,
+        else empty.
+        """
         return [f"values may be off; {self}"] * (self.most > WARNED)
 
 
@@ -108,7 +111,7 @@ class Layout:
 
     @property
     def empty(self) -> bool:
-        """True when no voxel differs from zero."""
+        """True when all voxels are zero."""
         return min(self.counts) == 0
 
     @cached_property
@@ -132,7 +135,7 @@ class DeviceCopy:
     views: int = 0
 
     def uploaded(self) -> Any:
-        """The storage on the device, moved there once."""
+        """Return the storage on the device, moved there at the first call."""
         from flexdt.twin.projection import gpu
 
         if self.there is None:
@@ -141,7 +144,7 @@ class DeviceCopy:
 
 
 def room_like(volume: Volume) -> Float32Array:
-    """Zeros (nz, ny, nx) with z contiguous in memory: what `back` can write into.
+    """Create zeros (nz, ny, nx) with z contiguous in memory, which `back` can write into.
 
     Example:
         >>> room_like(Volume(np.zeros((6, 4, 4)), 0.5)).strides[0]  # bytes: z is contiguous
@@ -154,11 +157,14 @@ def room_like(volume: Volume) -> Float32Array:
 
 
 def blank_layout(volume: Volume, room: Float32Array | None = None) -> Layout:
-    """The layout of the whole grid of `volume` over new zeros, or over `room` and what it holds:
-    what an adjoint writes into.
+    """Make the layout of the full grid of `volume`, for an adjoint to write into.
+
+    Args:
+        volume: its grid is used, not its values.
+        room: an array of `room_like`, used with its content; None for new zeros.
 
     Raises:
-        GeometryError: room is none that `room_like` could have made.
+        GeometryError: room has another shape or memory layout than `room_like` makes.
     """
     nz, ny, nx = volume.shape
     data = room_like(volume) if room is None else room
@@ -233,19 +239,21 @@ class Volume:
             raise GeometryError.instead(said, sizes, "positive sizes (x, y, z) in mm")
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:
-        """The values, (nz, ny, nx)."""
+        """Return the values, (nz, ny, nx)."""
         return np.array(self.data, dtype=dtype) if copy else np.asarray(self.data, dtype=dtype)
 
     def __dlpack__(self, **options: Any) -> Any:
-        """The values for another library, such as `torch.from_dlpack(volume)`, read-only."""
+        """Export the values to another library, such as `torch.from_dlpack(volume)`,
+        read-only.
+        """
         return self.data.__dlpack__(**options)
 
     def __dlpack_device__(self) -> Any:
-        """Where the values are: the processor's memory."""
+        """Return the device of the values: the processor's memory."""
         return self.data.__dlpack_device__()
 
     def __repr__(self) -> str:
-        """One line."""
+        """Describe the volume in one line."""
         sizes = [f"{size:g}" for size in self.voxel_xyz]
         voxel = sizes[0] if len(set(sizes)) == 1 else " x ".join(sizes)
         centre = ", ".join(f"{c:g}" for c in self.center_mm)
@@ -262,7 +270,7 @@ class Volume:
         )
 
     def to(self, device: str) -> Any:
-        """The volume on a device: "cpu", where it is, or "cuda", a `DeviceVolume`.
+        """Return the volume on a device: "cpu", this volume, or "cuda", a `DeviceVolume`.
 
         Raises:
             NotBuiltError: another device, or no CUDA device that works.
@@ -331,7 +339,7 @@ class Volume:
         return backend("notebook").show_volume(self, window)
 
     def to_xarray(self) -> Any:
-        """The values as an xarray DataArray (z, y, x) with positions [mm], which needs xarray.
+        """Convert the values to an xarray DataArray (z, y, x) with positions [mm].
 
         Raises:
             TwinError: xarray is not installed.
@@ -361,7 +369,7 @@ class Volume:
 
     @classmethod
     def load(cls, file: File) -> Volume:
-        """A volume that `save` or `flexdt reconstruct` wrote.
+        """Load a volume that `save` or `flexdt reconstruct` wrote.
 
         Raises:
             TwinError: another ending, or it is no such file.
@@ -380,8 +388,9 @@ class Volume:
 
     @property
     def sigma(self) -> Float32Array | None:
-        """Standard deviation of the noise in each voxel, (nz, ny, nx) [1/mm], as the images show it
-        (`reconstruct("fdk")`); None where it was not found. It is computed at each call.
+        """Standard deviation of the noise in each voxel, (nz, ny, nx) [1/mm], by the
+        images (`reconstruct("fdk")`); None if it was not estimated. Computed at each
+        access.
         """
         noise: Any = getattr(self, "_noise", None)  # of `volume_errors.with_errors`
         found: Float32Array | None = None if noise is None else noise.sigma(self)
@@ -389,9 +398,11 @@ class Volume:
 
     @property
     def bias_bound(self) -> Float32Array | None:
-        """Bound of what each voxel is off by beside the noise, (nz, ny, nx) [1/mm], NaN where no
-        data cover it (`reconstruct("fdk")`); None where it was not found. Computed at each call.
-        Where `accuracy.cut_off` it is an estimate.
+        """Bound of each voxel's deviation without noise, (nz, ny, nx) [1/mm]
+        (`reconstruct("fdk")`).
+
+        NaN where no data cover a voxel; None if it was not estimated. Computed at each
+        access. Where `accuracy.cut_off` it is an estimate.
         """
         bias: Any = getattr(self, "_bias", None)  # of `volume_errors.with_errors`
         found: Float32Array | None = None if bias is None else bias.bound(self)
@@ -399,8 +410,10 @@ class Volume:
 
     @property
     def accuracy(self) -> Accuracy | None:
-        """What the object's uniform regions may be off by, in short (`reconstruct("fdk")`); None
-        where it was not found, and where the images do not fit the geometry.
+        """Summary of how far the object's uniform regions may deviate
+        (`reconstruct("fdk")`).
+
+        None if it was not estimated, or if the images do not fit the geometry.
 
         Example:
             >>> volume = fx.reconstruct("my-scans/lego")  # doctest: +SKIP
@@ -436,7 +449,8 @@ class Volume:
         return np.array([self.center_mm - half, self.center_mm + half])[None]
 
     def centers(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Object-frame positions of the voxel centres along x (nx,), y (ny,) and z (nz,) [mm].
+        """Compute object-frame positions of voxel centres along x (nx,), y (ny,), z (nz,)
+        [mm].
 
         Example:
             >>> volume = Volume(np.zeros((6, 4, 4)), voxel_mm=0.5)
@@ -451,7 +465,7 @@ class Volume:
         return x, y, z
 
     def like(self, data: npt.NDArray[np.floating]) -> Volume:
-        """The same grid with other values (nz, ny, nx).
+        """Make a volume of other values (nz, ny, nx) on the same grid.
 
         Example:
             >>> volume = Volume(np.zeros((6, 4, 4)), voxel_mm=0.5)
@@ -463,7 +477,8 @@ class Volume:
         return replace(self, data=np.asarray(data, dtype=np.float32))
 
     def in_order(self, order: tuple[int, int, int]) -> Volume:
-        """The volume with axis order[0] (0 for x) in the place of x, order[1] in that of y, ...
+        """Return the volume with axis order[0] (0 for x) in the place of x, order[1] in
+        that of y, ...
 
         Nothing is copied; the layouts of these volumes are kept with this one's.
 
@@ -551,7 +566,7 @@ class DeviceVolume:
 
     @classmethod
     def blank(cls, like: Volume) -> DeviceVolume:
-        """Zeros on the grid of `like`."""
+        """Create zeros on the grid of `like`."""
         from flexdt.twin.projection import gpu
 
         layout = blank_layout(like)
@@ -560,8 +575,9 @@ class DeviceVolume:
 
     @classmethod
     def sharing(cls, like: Volume, flat: Any, strides: tuple[int, int]) -> DeviceVolume:
-        """Voxels that are there, on the grid of `like`: voxel (z, y, x) at flat[y * strides[0] +
-        x * strides[1] + z].
+        """Wrap voxels on the device, on the grid of `like`; the memory is shared.
+
+        Voxel (z, y, x) is at flat[y * strides[0] + x * strides[1] + z].
         """
         layout = replace(blank_layout(like), flat=flat, stride_y=strides[0], stride_x=strides[1])
         return cls(layout, like.shape, like.voxel_mm, like.center_mm)
@@ -582,7 +598,7 @@ class DeviceVolume:
         return {**memory, "shape": self.shape, "strides": self.strides}
 
     def to(self, device: str) -> Any:
-        """Itself on "cuda"; on "cpu" a `Volume`, downloaded.
+        """Return this volume for "cuda", or download it to a `Volume` for "cpu".
 
         Raises:
             NotBuiltError: another device.
@@ -630,7 +646,7 @@ class Grid:
         return 4 * math.prod(self.shape)
 
     def slab(self, first: int, last: int) -> Grid:
-        """Layers first <= z < last.
+        """Return the grid of layers first <= z < last.
 
         Example:
             >>> Grid((100, 200, 200), 0.1).slab(0, 20)
@@ -641,7 +657,8 @@ class Grid:
         return Grid((last - first, *self.shape[1:]), self.voxel_mm, (x, y, middle))
 
     def slabs(self, most_bytes: int) -> list[tuple[int, int]]:
-        """Layers (first, last) of slabs of at most `most_bytes` (but at least one layer) each.
+        """Cut into slabs of at most `most_bytes` (but at least one layer) each; lists
+        (first, last).
 
         Example:
             >>> Grid((100, 200, 200), 0.1).slabs(8_000_000)
@@ -651,7 +668,7 @@ class Grid:
         return cut(self.shape[0], math.ceil(self.shape[0] / layers))
 
     def blank(self) -> Volume:
-        """A volume of zeros on this grid, which takes no memory.
+        """Make a volume of zeros on this grid, which takes no memory.
 
         Example:
             >>> Grid((6, 4, 4), 0.5).blank()
@@ -662,12 +679,12 @@ class Grid:
 
 
 def cut(layers: int, count: int) -> list[tuple[int, int]]:
-    """Layers (first, last) of `count` slabs of about equal height."""
+    """List layers (first, last) of `count` slabs of about equal height."""
     return list(pairwise(round(i * layers / count) for i in range(count + 1)))
 
 
 def as_volume(volume: Volume | Grid) -> Volume:
-    """A volume as it is, a grid as zeros.
+    """Return a volume unchanged, a grid as a volume of zeros.
 
     Example:
         >>> as_volume(Grid((6, 4, 4), 0.5))
@@ -677,7 +694,9 @@ def as_volume(volume: Volume | Grid) -> Volume:
 
 
 def aligned_zeros(count: int) -> Float32Array:
-    """`count` float32 zeros starting on a cache line (pages are touched when first written)."""
+    """Create `count` float32 zeros that start on a cache line (pages touched at first
+    writing).
+    """
     raw = np.zeros(count + LANES, np.float32)
     skip = (-raw.ctypes.data // raw.itemsize) % LANES
     return raw[skip : skip + count]
@@ -712,14 +731,16 @@ class _Memory:
 
 
 def _flat_alias(data: Float32Array, count: int) -> Float32Array:
-    """`count` floats from the first voxel on, without the read-only mark: a kernel that can also
-    write is compiled for plain arrays only. Projection never writes into a volume.
+    """Return `count` floats from the first voxel on, without the read-only mark.
+
+    A kernel that can also write is compiled for plain arrays only. Projection never
+    writes into a volume.
     """
     return np.asarray(_Memory(data, count))
 
 
 def edges_xyz(voxel_mm: float | Vector3) -> Vector3:
-    """Edge lengths (x, y, z) [mm] of voxels given by these, or by one for all three."""
+    """Return edge lengths (x, y, z) [mm] of voxels, given as three or as one for all."""
     if isinstance(voxel_mm, (int, float)):
         return _vector((voxel_mm,) * 3, "voxel_mm")
     return _vector(voxel_mm, "voxel_mm")

@@ -23,12 +23,12 @@ from flexdt.twin.projection.kernels.compiling import fetch_next, kernel, maker, 
 
 TINY = 1e-300
 BAND = 16
-"""Detector rows a job."""
+"""Detector rows in a job."""
 
 
 @kernel
 def cut_by_slab(t0, t1, at, low, high, rate, step, first):
-    """Narrow [t0, t1] to low <= at + t (rate + column * step) <= high."""
+    """Cut [t0, t1] down to low <= at + t (rate + column * step) <= high."""
     # A ray along the slab gets TINY: both quotients are huge, of one sign where it runs outside (no
     # chord is left) and of two where it runs inside (nothing is cut). No branch, so it vectorises.
     for i in range(t0.size):
@@ -44,7 +44,7 @@ def cut_by_slab(t0, t1, at, low, high, rate, step, first):
 
 @kernel
 def cut_by_quadric(t0, t1, q, d, e, first):
-    """Narrow [t0, t1] to |q + t (d + column * e)| <= 1, all three already mapped by M."""
+    """Cut [t0, t1] down to |q + t (d + column * e)| <= 1, all three already mapped by M."""
     qq = q[0] * q[0] + q[1] * q[1] + q[2] * q[2]
     for i in range(t0.size):
         c = first + i
@@ -74,7 +74,10 @@ def cut_by_quadric(t0, t1, q, d, e, first):
 
 @kernel
 def add_chords(row, t0, t1, weight, d, e, first):
-    """row += weight * chord length; d + column * e is the ray from source to pixel [mm]."""
+    """Add weight * chord length to row.
+
+    d + column * e is the ray from source to pixel [mm].
+    """
     for i in range(row.size):
         c = first + i
         dx = d[0] + c * e[0]
@@ -86,7 +89,7 @@ def add_chords(row, t0, t1, weight, d, e, first):
 
 @kernel
 def mapped(m, p, out):
-    """out = M p for M as nine numbers."""
+    """Compute out = M p for M as nine numbers."""
     for i in range(3):
         out[i] = m[3 * i] * p[0] + m[3 * i + 1] * p[1] + m[3 * i + 2] * p[2]
 
@@ -149,13 +152,15 @@ def project_convex(
 
 
 MESH_BAND = 64
-"""The same of meshes."""
+"""Detector rows in a job of meshes."""
 
 
 @kernel
 def edge_form(p, i, j, g, form):
-    """form[0:3]: affine function a + b c + e r of the pixel, positive where the ray passes to the
-    left of the edge from the lower to the higher vertex number; p (k, 3) seen from the source.
+    """Compute an edge's affine function a + b c + e r of the pixel into form[0:3].
+
+    It is positive where the ray passes to the left of the edge from the lower to the
+    higher vertex number; p (k, 3) seen from the source.
     """
     a, b = (i, j) if i < j else (j, i)
     # p_a x (p_b - p_a): the difference of far vertices would lose the digits that matter.
@@ -241,7 +246,9 @@ def draw_triangle(sums, p, pixels, face, g, row0, row1, cols, forms, flips, plan
 
 @kernel
 def locate(vertices, g, inverse, p, pixels):
-    """Vertices seen from the source, and their pixel coordinates."""
+    """Transform vertices to positions seen from the source and compute their pixel
+    coordinates.
+    """
     for i in range(len(vertices)):
         x = vertices[i, 0] - g[0]
         y = vertices[i, 1] - g[1]
@@ -258,7 +265,7 @@ def locate(vertices, g, inverse, p, pixels):
 
 @maker
 def make_band(vertices, cols):
-    """A worker's arrays: sums, vertices, pixels, edge forms, flips, plane."""
+    """Create a worker's arrays: sums, vertices, pixels, edge forms, flips, plane."""
     return (
         np.empty((MESH_BAND, cols)),
         np.empty((vertices, 3)),

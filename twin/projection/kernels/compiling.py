@@ -40,13 +40,14 @@ from numba.extending import intrinsic
 from flexdt.twin import kernel_threads, long_work
 
 LOG = logging.getLogger("flexdt.kernels")
-"""To standard error, unless the program has set up logging."""
+"""Logger of the kernels, to standard error unless the program has set up logging."""
 SLOW = "flexdt: compiling %s (once on this machine; some seconds, and perhaps other kernels)"
-"""What a process says when it first compiles, instead of loading from the disk cache."""
+"""Message of a process that compiles for the first time instead of loading the disk
+cache."""
 
 
 LAYER = "numba_parallel_for"
-"""What numba's parallel loops call; its threading layer has it."""
+"""Name of the function of numba's threading layer that parallel loops call."""
 ALONE = "flexdt_alone"
 """`kernel_threads.ALONE` for the linker."""
 binding.add_symbol(ALONE, ctypes.addressof(kernel_threads.ALONE))
@@ -110,7 +111,9 @@ class _LinkedLibrary(JITCodeLibrary):  # type: ignore[misc]
 
 @contextmanager
 def _linking(codegen: Any) -> Iterator[None]:
-    """Until the end, under numba's compiler lock, all libraries but those that exist are linked."""
+    """Link all libraries made within the context, except existing ones, under numba's
+    compiler lock.
+    """
     if "_library_class" in vars(codegen):
         yield
         return
@@ -181,11 +184,11 @@ fused = partial(kernel, fastmath={"contract", "nsz"})
 
 
 def sources(*modules: ModuleType) -> int:
-    """A number that changes with the text of modules.
+    """Compute a number that changes with the text of modules.
 
-    numba's disk cache of a function watches the function's own file only. An entry point that calls
-    kernels of other files refers to this number as a free variable, which is part of the cache's
-    key; otherwise an edited kernel would go on running in its old form.
+    numba's disk cache of a function watches the function's own file only. An entry point
+    that calls kernels of other files refers to this number as a free variable, which is
+    part of the cache's key; otherwise the old form of an edited kernel would stay in use.
     """
     text = "".join(inspect.getsource(module) for module in modules)
     return zlib.crc32(text.encode())
@@ -201,7 +204,7 @@ def _address(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> A
 
 @intrinsic
 def prefetch(typingctx: Any, array: Any, index: Any) -> Any:
-    """prefetch(array, index): fetch array[index]'s cache line for reading; any index is safe."""
+    """Fetch array[index]'s cache line for reading; any index is safe."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         address = _address(context, builder, signature.args[0], *args)
@@ -218,7 +221,7 @@ def prefetch(typingctx: Any, array: Any, index: Any) -> Any:
 
 @intrinsic
 def fetch_next(typingctx: Any, counter: Any) -> Any:
-    """fetch_next(counter): counter[0] before one is added to it, atomically; counter is int64."""
+    """Return counter[0] and add one to it, atomically; counter is int64."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         word = ir.IntType(64)
@@ -230,8 +233,8 @@ def fetch_next(typingctx: Any, counter: Any) -> Any:
 
 @intrinsic
 def count_one(typingctx: Any, counters: Any, index: Any) -> Any:
-    """count_one(counters, index): add one to counters[index], an int64, atomically, after all that
-    this thread has written.
+    """Add one to counters[index], an int64, atomically, after all earlier writes of this
+    thread.
     """
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -244,7 +247,7 @@ def count_one(typingctx: Any, counters: Any, index: Any) -> Any:
 
 @intrinsic
 def _look(typingctx: Any, counters: Any, index: Any) -> Any:
-    """_look(counters, index): counters[index] now, and all that was written before it counted."""
+    """Return counters[index]; all that was written before it was counted is visible."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         address = _address(context, builder, signature.args[0], *args)
@@ -263,7 +266,7 @@ SLEEP = "flexdt_sleep"
 binding.add_symbol(SLEEP, ctypes.cast(_sleep, ctypes.c_void_p).value)
 _rest = types.ExternalFunction(SLEEP, types.int32(types.uint32))
 LOOKS = 2000
-"""Looks before a thread sleeps: some 20 microseconds, the time that sleeping takes."""
+"""Polls before a thread sleeps: some 20 microseconds, the time that a sleep takes."""
 
 
 @kernel

@@ -47,8 +47,9 @@ SOURCES = sources(fan_rays_kernels, fan_types, fan_walk_kernels, siddon_kernels)
 
 @inline
 def carry_fan(box, g, grid, found, rays, work, n, buffer, transposed):
-    """Integrals of one fan of n collected rays into the job's buffer; transposed, adds the buffer's
-    values to the voxels.
+    """Sum the integrals of a fan of n collected rays into the job's buffer.
+
+    Transposed, it adds the buffer's values to the voxels.
     """
     fan = describe(grid, found, n)
     if not fan.together:
@@ -93,7 +94,7 @@ def put(image, buffer, starts, ends, width, top, bottom):
 
 @kernel
 def take(image, buffer, starts, ends, width, top, bottom):
-    """The transpose of `put`."""
+    """Apply the transpose of `put`: copy the image's pixels into the buffer."""
     for r in range(top, bottom):
         row = image[r, starts[r] : ends[r]]
         at = (r - top) * width
@@ -105,7 +106,7 @@ def take(image, buffer, starts, ends, width, top, bottom):
 def work_on(
     box, g, lines, first, last, shadow, image, starts, ends, found, rays, work, buffer, transposed
 ):
-    """A job: fill the columns of one image between two lines; transposed, from the image."""
+    """Do one job: fill the columns of an image between two lines; transposed, read them."""
     rows, cols = image.shape
     # The job's pixels lie between two slanted lines: each row has a start and an end of its own,
     # and the buffer holds the rows one behind the other, all `width` long.
@@ -152,16 +153,17 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
 
     @parallel
     def spread_fans(box, fans, turns, units, slices, shadows, marks, workers, values):
-        """The transpose of `project_fans`: values (n, rows, cols) to the voxels.
+        """Apply the transpose of `project_fans`: add values (n, rows, cols) to the
+        voxels.
 
-        No two workers write the same voxel at a time: turns (k, 2) are taken one after the other,
-        each a range of units that have no voxel column in common; units (m, 2): ranges of jobs;
-        slices (s, 2): ranges of z; shadows (s, n, 4) of each; marks (s, 2 nx ny): see
-        `siddon_kernels.open_column`.
+        No two workers write the same voxel at a time: turns (k, 2) are taken one after
+        the other, each a range of units that have no voxel column in common; units (m,
+        2): ranges of jobs; slices (s, 2): ranges of z; shadows (s, n, 4) of each; marks
+        (s, 2 nx ny): see `siddon_kernels.open_column`.
 
-        All turns are one parallel loop: a worker that is free takes the next item, a unit and a
-        slice, and begins when every item of the turn before is done. Items are taken in order, so
-        one that is waited for is being worked on.
+        All turns are one parallel loop: a worker that is free takes the next item, a unit
+        and a slice, and begins when every item of the turn before is done. Items are
+        taken in order, so one that is waited for is being worked on.
         """
         _ = key
         views, lines, jobs, room, widest = fans
@@ -207,7 +209,7 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
 
 @parallel
 def open_rest(box, slices, marks):
-    """Zero the voxel columns that nothing was added to."""
+    """Set voxel columns to which nothing was added to zero."""
     for ix in prange(box.nx):
         for part in range(len(slices)):
             low, high = slices[part]

@@ -24,7 +24,9 @@ ON_AXIS = 0.2
 
 @kernel
 def oriented(box, g, lines, line, rows):
-    """The box as seen along the central ray of the fan between `line` and the next."""
+    """Compute the box as seen along the central ray of the fan between `line` and the
+    next.
+    """
     r = 0.5 * (rows - 1)
     c = 0.5 * (lines[line, 0] + lines[line + 1, 0] + (lines[line, 1] + lines[line + 1, 1]) * r)
     dx = g[3] + c * g[6] + r * g[9]
@@ -55,7 +57,9 @@ def oriented(box, g, lines, line, rows):
 
 @kernel
 def columns_of(lines, first, last, cols, starts, ends):
-    """Columns between two lines in each row, starts to ends; returns the widest range."""
+    """Find the columns between two lines in each row, starts to ends; returns the widest
+    range.
+    """
     a, b = lines[first], lines[last]
     width = 1
     for r in range(starts.size):
@@ -67,10 +71,10 @@ def columns_of(lines, first, last, cols, starts, ends):
 
 @kernel
 def collect(found, grid, g, lines, line, starts, width, shadow):
-    """Gather the pixels of a fan; returns their number.
+    """Collect the pixels of a fan; returns their number.
 
-    starts: first column of the job's buffer in each row; width: its columns; shadow: rows and
-    columns that the box can reach, the first of them the buffer's first.
+    starts: first column of the job's buffer in each row; width: its columns; shadow: rows
+    and columns that the box can reach, the first of them the buffer's first.
     """
     row, column, slot = found.row, found.column, found.slot
     low, high = lines[line], lines[line + 1]
@@ -112,7 +116,7 @@ def collect(found, grid, g, lines, line, starts, width, shadow):
 
 @kernel
 def describe(grid, found, n):
-    """The fan of n collected rays."""
+    """Compute the `Fan` of n collected rays."""
     slope, rise, span = found.slope[:n], found.rise[:n], found.span[:n]
     m_low, m_high, rise_low, rise_high = slope[0], slope[0], rise[0], rise[0]
     nearest = span[0]
@@ -145,7 +149,7 @@ def describe(grid, found, n):
 
 @kernel
 def sort_by_slope(grid, fan, found, rays, bins, n):
-    """Bring the rays that meet the box into order of slope (by bins); returns how many."""
+    """Sort the rays that meet the box by slope (in bins); returns their number."""
     slope, rise, slot, part = found.slope, found.rise, found.slot, found.bin
     reach0, reach1 = fan.begin - grid.st, fan.j1 - grid.st
     # A counting sort: count the rays of each bin, turn counts into first places, deal out.
@@ -219,7 +223,7 @@ def start(grid, fan, rays, work, n):
 
 @maker
 def make_found(room):
-    """Arrays for fans of up to `room` pixels."""
+    """Create arrays for fans of up to `room` pixels."""
     return Found(
         row=np.empty(room), column=np.empty(room), slope=np.empty(room), rise=np.empty(room),
         span=np.empty(room), slot=np.empty(room, np.uint32), bin=np.empty(room),
@@ -228,7 +232,7 @@ def make_found(room):
 
 @maker
 def make_rays(room):
-    """Arrays for fans of up to `room` rays."""
+    """Create arrays for fans of up to `room` rays."""
     f32, u32 = np.float32, np.uint32
     return Rays(
         slope=np.empty(room), rise=np.empty(room), slot=np.empty(room, u32),
@@ -241,7 +245,7 @@ def make_rays(room):
 
 @maker
 def make_work(slabs, levels):
-    """A worker's arrays for a box of up to `slabs` slabs and `levels` levels."""
+    """Create a worker's arrays for a box of up to `slabs` slabs and `levels` levels."""
     f32 = np.float32
     return Work(
         head=np.empty(slabs + 2, np.uint32), bins=np.empty(BINS + 1, np.int64),

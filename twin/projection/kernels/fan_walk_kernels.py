@@ -39,21 +39,21 @@ BINS = 64
 
 @fused
 def add_one(total, a, column):
-    """total += a * column."""
+    """Add a * column to total."""
     for k in range(total.size):
         total[k] += a * column[k]
 
 
 @fused
 def add_two(total, a, first, b, second):
-    """total += a * first + b * second."""
+    """Add a * first + b * second to total."""
     for k in range(total.size):
         total[k] += a * first[k] + b * second[k]
 
 
 @fused
 def add_jump(total, moment, a, first, b, second, arm):
-    """total += a * first + b * second, moment += arm * (first - second)."""
+    """Add a * first + b * second to total and arm * (first - second) to moment."""
     for k in range(total.size):
         total[k] += a * first[k] + b * second[k]
         moment[k] += arm * (first[k] - second[k])
@@ -61,21 +61,23 @@ def add_jump(total, moment, a, first, b, second, arm):
 
 @fused
 def mix(out, right, left, right_before, left_before):
-    """out = (right - left) - (right_before - left_before)."""
+    """Compute out = (right - left) - (right_before - left_before)."""
     for k in range(out.size):
         out[k] = (right[k] - left[k]) - (right_before[k] - left_before[k])
 
 
 @inline
 def part_of(rays, first, last):
-    """What the correction at a vertex touches, of rays first to last - 1 of a sorted fan."""
+    """Select what the correction at a vertex changes, of rays first to last - 1 of a
+    sorted fan.
+    """
     some = slice(first, last)
     return rays.acc[some], rays.weight[some], rays.tilt[some], rays.level[some], rays.picked[some]
 
 
 @fused
 def correct(part, jump, offset, reach):
-    """acc -= max(0, offset + tilt * reach) * weight * jump[level], ray by ray.
+    """Subtract max(0, offset + tilt * reach) * weight * jump[level] from acc, ray by ray.
 
     offset + tilt * reach is d, how far a ray lies beyond the vertex; weight is 1 / m.
     """
@@ -90,7 +92,7 @@ def correct(part, jump, offset, reach):
 
 @fused
 def correct_back(part, jump, offset, reach):
-    """The transpose of `correct`: jump[level] -= max(0, ...) * weight * acc."""
+    """Apply the transpose of `correct`: jump[level] -= max(0, ...) * weight * acc."""
     acc, weight, tilt, level, picked = part
     for q in range(acc.size):
         beyond = offset + tilt[q] * reach
@@ -101,19 +103,21 @@ def correct_back(part, jump, offset, reach):
 
 @inline
 def column_at(grid, j, i):
-    """Position in memory of voxel column (l = i, t = j)."""
+    """Compute the position in memory of voxel column (l = i, t = j)."""
     return grid.base + j * grid.hop_t + i * grid.hop_l
 
 
 @inline
 def mark_of(grid, j, i):
-    """Place of voxel column (l = i, t = j) in the spans or marks."""
+    """Compute the index of voxel column (l = i, t = j) in the spans or marks."""
     return 2 * (grid.span_base + j * grid.span_t + i * grid.span_l)
 
 
 @inline
 def occupied(spans, grid, j, i):
-    """Levels - 1, [first, last), of voxel column (l = i, t = j) that are not empty."""
+    """Return the levels - 1, [first, last), of voxel column (l = i, t = j) that are not
+    empty.
+    """
     if i < 0 or i >= grid.nl or j < 0 or j >= grid.nt:
         return grid.nz, 0
     at = mark_of(grid, j, i)
@@ -125,7 +129,9 @@ def occupied(spans, grid, j, i):
 
 @inline
 def levels_between(grid, fan, t0, t1):
-    """Levels - 1, [w0, w1), that rays of the fan can touch from t0 to t1, with one to spare."""
+    """Find the levels - 1, [w0, w1), that the fan can touch from t0 to t1, with one to
+    spare.
+    """
     a, b = t0 - grid.st, t1 - grid.st
     low = grid.sz + min(fan.rise_low * a, fan.rise_low * b) - 1.0
     high = grid.sz + max(fan.rise_high * a, fan.rise_high * b) + 2.0
@@ -136,7 +142,7 @@ def levels_between(grid, fan, t0, t1):
 
 @inline
 def difference(flat, grid, j, i, a, b):
-    """Value of level a minus value of level b in voxel column (l = i, t = j); 0 outside."""
+    """Compute level a minus level b in voxel column (l = i, t = j); 0 outside."""
     if i < 0 or i >= grid.nl:
         return ZERO
     inside = np.uint32(grid.nz)
@@ -151,11 +157,13 @@ def difference(flat, grid, j, i, a, b):
 
 @inline
 def cross_levels(flat, grid, fan, rays, work, j, r0, r1, share):
-    """All z crossings in slab j, from the list head[j]; each ray's next one goes on its list.
+    """Process all z crossings in slab j from the list head[j] and list each ray's next
+    one.
 
-    The integral inside the slab is counted from the reference line's column r0 to the ray's own.
-    Rays that share the line change columns where it does: (x - r1) / m would be the same, but rays
-    within a voxel plane have slopes of rounding errors, by which nothing can be divided.
+    The integral inside the slab is counted from the reference line's column r0 to the
+    ray's own. Rays that share the line change columns where it does: (x - r1) / m would
+    be the same, but rays within a voxel plane have slopes of rounding errors, by which
+    nothing can be divided.
     """
     cross, pace, slope, weight, ratio = rays.cross, rays.pace, rays.slope, rays.weight, rays.ratio
     all_acc, all_level, following = rays.acc, rays.level, rays.following
@@ -232,7 +240,9 @@ def cross_levels(flat, grid, fan, rays, work, j, r0, r1, share):
 
 @inline
 def add_pair(flat, grid, j, i, a, b, value):
-    """The transpose of `difference`."""
+    """Apply the transpose of `difference`: add value to level a, subtract it from level
+    b.
+    """
     if i < 0 or i >= grid.nl:
         return
     inside = np.uint32(grid.nz)
@@ -245,7 +255,7 @@ def add_pair(flat, grid, j, i, a, b, value):
 
 @inline
 def cross_levels_back(flat, grid, fan, rays, work, j, r0, r1, share):
-    """The transpose of `cross_levels`: total and moment hold what each level is to receive."""
+    """Apply the transpose of `cross_levels`: total and moment receive each level's share."""
     cross, pace, slope, weight, ratio = rays.cross, rays.pace, rays.slope, rays.weight, rays.ratio
     value, all_level, following = rays.acc, rays.level, rays.following
     head, total, moment = work.head, work.total, work.moment

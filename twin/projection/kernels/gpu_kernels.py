@@ -52,23 +52,23 @@ UNROLLED = 4
 ANCHORED = 32
 """Slabs between two positions from fixed point; a power of 2."""
 BITS = 44
-"""Of a position, behind the point."""
+"""Bits of a position behind the point."""
 FIXED = float(2**BITS)
 HALF_FIXED = 2 ** (BITS - 1)
 UNIT = np.float32(1.0 / FIXED)
 REACH = float(2**18)
-"""Positions beyond are taken for this: outside of every box."""
+"""Limit of positions; larger ones are clipped to it, outside of every box."""
 MAGIC = np.float32(1.5 * 2**23)
 MAGIC_BITS = 0x4B400000
 MARGIN = np.float32(0.01)
 """Slabs this near to where a ray enters or leaves the box are checked; single precision places
 these points within 4e-3 slabs in boxes of up to 2^14: 3 roundings, each of 2^-24."""
 STEEP = np.float32(1e30)
-"""Stands for one over a slope of zero."""
+"""Value used for one over a slope of zero."""
 ZERO, ONE = np.float32(0), np.float32(1)
 NEVER = 1 << 30
 RISE = 0.25
-"""Voxels along z that a ray of `project_columns` rises in a slab, at most."""
+"""Largest rise along z of a ray of `project_columns` in a slab [voxels]."""
 LANES = 0xFFFFFFFF
 
 LANES_MEET = not config.ENABLE_CUDASIM
@@ -145,7 +145,7 @@ else:
 
 @cuda.jit(device=True, inline=True)
 def least(i):
-    """The smallest i of a warp."""
+    """Return the smallest i of a warp."""
     for step in (16, 8, 4, 2, 1):
         i = min(i, exchange(i, step))
     return i
@@ -153,7 +153,7 @@ def least(i):
 
 @cuda.jit(device=True, inline=True)
 def most(i):
-    """The largest i of a warp."""
+    """Return the largest i of a warp."""
     for step in (16, 8, 4, 2, 1):
         i = max(i, exchange(i, step))
     return i
@@ -161,7 +161,7 @@ def most(i):
 
 @cuda.jit(device=True, inline=True)
 def direction(views, view, r, c, axis):
-    """Pixel (r, c) minus source along an axis, rounded as the processor does."""
+    """Compute pixel (r, c) minus source along an axis, rounded as the processor does."""
     across = times(float(c), views[view, 6 + axis])
     down = times(float(r), views[view, 9 + axis])
     return plus(plus(views[view, 3 + axis], across), down)
@@ -169,8 +169,12 @@ def direction(views, view, r, c, axis):
 
 @cuda.jit(device=True, inline=True)
 def fixed_line(start, slope, n):
-    """A line over the slabs: position and slope in fixed point, slope and its inverse in single
-    precision, and the slabs between which it is within [0, n).
+    """Compute a line over the slabs in fixed point.
+
+    Returns:
+        position and slope in fixed point, slope and its inverse in single precision, and
+            the slabs
+        between which the line is within [0, n).
     """
     start = min(max(start, -REACH), REACH)
     position = np.int64(math.floor(start * FIXED))
@@ -185,7 +189,7 @@ def fixed_line(start, slope, n):
 
 @cuda.jit(device=True, inline=True)
 def anchor(position, rate, k):
-    """Nearest plane at slab k, less the bits of MAGIC, and the signed distance from it."""
+    """Find the nearest plane at slab k, less the bits of MAGIC, and its signed distance."""
     at = position + k * rate
     plane = (at + HALF_FIXED) >> BITS
     return narrow(plane - MAGIC_BITS), np.float32(at - (plane << BITS)) * UNIT
@@ -193,8 +197,12 @@ def anchor(position, rate, k):
 
 @cuda.jit(device=True, inline=True)
 def crossing(t, slope, distance, steps):
-    """t slabs after an anchor: the bits that number the voxel, and the share of the slab before
-    that lies behind the last plane crossed.
+    """Compute the state t slabs after an anchor.
+
+    Returns:
+        the bits that number the voxel, and the share of the slab before that is behind
+            the last
+        plane crossed.
     """
     y = fused(t, slope, distance)
     floor, bits = floor_bits(y)
@@ -202,11 +210,13 @@ def crossing(t, slope, distance, steps):
 
 
 def slab_kernel(transposed):
-    """The slab walk as a kernel; forward or transposed."""
+    """Compile the slab walk as a kernel; forward or transposed."""
 
     @cuda.jit(device=True, inline=True)
     def meet(flat, inside, p, share, value):
-        """What share of a slab in voxel p gives, or (transposed) takes."""
+        """Read the contribution of a share of a slab in voxel p, or (transposed) add to
+        it.
+        """
         if not inside or share <= ZERO:
             return ZERO
         if transposed:
@@ -336,17 +346,21 @@ def slab_kernel(transposed):
 
 
 def column_kernel(transposed):
-    """The slab walk of views whose detector columns are parallel to z; forward or transposed.
+    """Compile the slab walk of views with detector columns parallel to z; forward or
+    transposed.
 
-    Rays of one column have their line in x and y in common, and a warp has rays of one column:
-    each lane finds the crossing of one of the next 32 slabs with the planes of b, for all lanes.
-    Rays rise by at most `RISE` voxels a slab, so that a lane knows the slab of its next crossing
-    with a plane of z, and adds up to 8 times from one position of fixed point to the next.
+    Rays of one column have their line in x and y in common, and a warp has rays of one
+    column: each lane finds the crossing of one of the next 32 slabs with the planes of b,
+    for all lanes. Rays rise by at most `RISE` voxels a slab, so that a lane knows the
+    slab of its next crossing with a plane of z, and adds up to 8 times from one position
+    of fixed point to the next.
     """
 
     @cuda.jit(device=True, inline=True)
     def meet(flat, inside, p, share, value):
-        """What share of a slab in voxel p gives, or (transposed) takes."""
+        """Read the contribution of a share of a slab in voxel p, or (transposed) add to
+        it.
+        """
         if not inside or share <= ZERO:
             return ZERO
         if transposed:
@@ -483,7 +497,7 @@ def column_kernel(transposed):
 
 @cuda.jit(device=True, inline=True)
 def enter_box(s, d, n, enter, leave):
-    """Narrow [enter, leave] to where s + t d lies in [0, n)."""
+    """Cut [enter, leave] down to where s + t d is in [0, n)."""
     if d == 0.0:
         if s < 0.0 or s >= n:
             return 1.0, 0.0
@@ -495,8 +509,12 @@ def enter_box(s, d, n, enter, leave):
 
 @cuda.jit(device=True, inline=True)
 def first_crossing(s, d, n, enter, unit):
-    """Voxel at entry, distance of the first crossing after it, distance between crossings and
-    crossings until the box ends; distances in `unit`s of t.
+    """Find the first crossing of an axis after the entry, in `unit`s of t.
+
+    Returns:
+        voxel at entry, distance of the first crossing after it, distance between
+            crossings, and
+        crossings until the box ends.
     """
     at = plus(s, times(enter, d))
     # On the device, floor gives a float.
@@ -509,10 +527,12 @@ def first_crossing(s, d, n, enter, unit):
 
 
 def ray_kernel(transposed):
-    """Single rays from voxel to voxel as a kernel, for any geometry; forward or transposed.
+    """Compile the walk of single rays from voxel to voxel; any geometry, forward or
+    transposed.
 
-    Entry and exit are computed in double precision; the walk counts crossings from the entry in
-    single precision (error below 1e-4 of a voxel, not growing with the distance to the source).
+    Entry and exit are computed in double precision; the walk counts crossings from the
+    entry in single precision (error below 1e-4 of a voxel, not growing with the distance
+    to the source).
     """
 
     @cuda.jit
@@ -596,7 +616,7 @@ project_rays, spread_rays = ray_kernel(False), ray_kernel(True)
 
 @cuda.jit
 def clear(values):
-    """values = 0: what is added to begins on the device, not with zeros from the host."""
+    """Set values to 0 on the device, which saves sending zeros from the host."""
     i = cuda.grid(1)
     if i < values.size:
         values[i] = 0
@@ -604,7 +624,9 @@ def clear(values):
 
 @cuda.jit
 def unscale(sums, factor, flat):
-    """flat += sums / factor: what was added up in integers, for equal bytes at every run."""
+    """Compute flat += sums / factor from sums of integers, whose bytes are equal at every
+    run.
+    """
     i = cuda.grid(1)
     if i < flat.size:
         flat[i] += np.float32(sums[i] / factor)
@@ -615,13 +637,15 @@ DOT, SUM, LARGEST = range(3)
 FOLDING = (256, 256)
 """Blocks, and threads a block, of `fold`."""
 RUN = 64
-"""Numbers added in single precision before they join the rest in double precision, of which
-consumer cards do a 64th as many a second."""
+"""Numbers added in single precision before they join the sum in double precision, in
+which consumer cards are 64 times slower."""
 
 
 @cuda.jit
 def combine(kind, a, b, number, alone, out):
-    """out = a (kind) b, or a (kind) number if alone; a RATIO is 0 where b is at most `number`."""
+    """Compute out = a (kind) b, or a (kind) number if alone; a RATIO is 0 where b <=
+    `number`.
+    """
     i = cuda.grid(1)
     if i >= out.size:
         return
@@ -642,9 +666,10 @@ def combine(kind, a, b, number, alone, out):
 
 @cuda.jit
 def fold(kind, a, b, parts):
-    """parts[i] = what thread i finds in every parts.size-th run of numbers: same bytes each time.
+    """Reduce every parts.size-th run of numbers into parts[i], one thread each.
 
-    kind: DOT adds a b, SUM adds a, LARGEST takes the largest a.
+    The bytes of the result are the same at every call. Kinds: DOT adds a b, SUM adds a,
+    LARGEST takes the largest a.
     """
     i = cuda.grid(1)
     if i >= parts.size:

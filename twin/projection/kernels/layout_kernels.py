@@ -11,13 +11,15 @@ from numba import prange
 from flexdt.twin.projection.kernels.compiling import parallel
 
 BLOCK = 32
-"""Voxels a side of a block: two of them are 8 kB, a quarter of a usual first cache."""
+"""Edge of a block [voxels]: two blocks are 8 kB, a quarter of a usual first cache."""
 
 
 @parallel
 def transpose(data, flat, stride_x, stride_y, adding, first_y, last_y):
-    """flat[y * stride_y + x * stride_x + z] = data[z, y, x] (adding: +=) for first_y <= y <
-    last_y, in blocks that fit the first cache.
+    """Copy data to flat[y * stride_y + x * stride_x + z] (adding: add), first_y <= y <
+    last_y.
+
+    Works in blocks that fit the first cache.
     """
     nz, _, nx = data.shape
     for y in prange(first_y, last_y):
@@ -57,7 +59,7 @@ def occupied(flat, stride_x, stride_y, nz, first, last, first_y, last_y):
 CHECKED = 1 << 16
 """Numbers that a thread checks at a time."""
 SIZE_BITS, INFINITE = np.uint32(0x7FFFFFFF), np.uint32(0x7F800000)
-"""Bits of a float32 without its sign, and these of infinity: NaN's are more."""
+"""Bits of a float32 without its sign, and those of infinity; NaN has larger ones."""
 
 
 @parallel

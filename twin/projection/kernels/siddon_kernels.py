@@ -31,7 +31,9 @@ from flexdt.twin.projection.kernels.fan_types import Box
 
 @inline
 def clip(s, d, n, enter, leave):
-    """Narrow [enter, leave] to the t for which s + t d lies in [0, n]; (1, 0) if there are none."""
+    """Cut [enter, leave] down to the t where s + t d is in [0, n]; (1, 0) if there are
+    none.
+    """
     if d != 0.0:
         a, b = -s / d, (n - s) / d
         return max(enter, min(a, b)), min(leave, max(a, b))
@@ -44,7 +46,9 @@ def clip(s, d, n, enter, leave):
 
 @inline
 def clip_to_box(nx, ny, nz, sx, sy, sz, dx, dy, dz):
-    """Ray parameters (enter, leave) of s + t d, 0 <= t <= 1, in a box of unit voxels."""
+    """Compute ray parameters (enter, leave) of s + t d, 0 <= t <= 1, in a box of unit
+    voxels.
+    """
     enter, leave = clip(sx, dx, nx, 0.0, 1.0)
     enter, leave = clip(sy, dy, ny, enter, leave)
     return clip(sz, dz, nz, enter, leave)
@@ -52,10 +56,11 @@ def clip_to_box(nx, ny, nz, sx, sy, sz, dx, dy, dz):
 
 @inline
 def first_step(s, d, n, enter, hop):
-    """Where the walk along one axis begins.
+    """Find the start of the walk along one axis.
 
     Returns:
-        voxel at entry, steps left until the box ends, t of the next crossing, t between crossings,
+        voxel at entry, steps left until the box ends, t of the next crossing, t between
+            crossings,
         and the memory step signed by direction.
     """
     # Rounding at the entry may give the voxel before the box or behind it.
@@ -70,9 +75,11 @@ def first_step(s, d, n, enter, hop):
 
 @kernel
 def open_column(flat, marks, at, first, nz):
-    """Zero a voxel column, flat[first : first + nz], before the first addition to it.
+    """Set a voxel column, flat[first : first + nz], to zero before the first addition to
+    it.
 
-    marks[at] is set once that has been done, so memory with old values needs no pass of its own.
+    marks[at] is set once that has been done, so memory with old values needs no pass of
+    its own.
     """
     if marks[at] == 0:
         marks[at] = 1
@@ -81,7 +88,9 @@ def open_column(flat, marks, at, first, nz):
 
 @kernel
 def ray_of(box, g, r, c):
-    """Direction of pixel (r, c) from the source in voxels, and its length [mm]."""
+    """Compute the direction of pixel (r, c) from the source in voxels, and its length
+    [mm].
+    """
     dx = g[3] + c * g[6] + r * g[9]
     dy = g[4] + c * g[7] + r * g[10]
     dz = g[5] + c * g[8] + r * g[11]
@@ -91,8 +100,10 @@ def ray_of(box, g, r, c):
 
 @inline
 def walk_ray(box, g, r, c, value, transposed):
-    """Line integral of the ray to pixel (r, c); transposed, adds value times its length in each
-    voxel to that voxel, and box.spans are the marks of `open_column`, two for each voxel column.
+    """Compute the line integral of the ray to pixel (r, c), voxel by voxel.
+
+    Transposed, it adds value times the ray's length in each voxel to that voxel, and
+    box.spans are the marks of `open_column`, two for each voxel column.
     """
     dx, dy, dz, length = ray_of(box, g, r, c)
     nx, ny, nz = box.nx, box.ny, box.nz
@@ -161,10 +172,12 @@ def project_rays(box, views, chosen, out, tile, first_job, last_job):
 
 @parallel
 def spread_rays(box, views, chosen, values, slices, marks, first_column, last_column):
-    """The transpose of `project_rays` for columns of the chosen views, counted through: adds to
-    box.flat. Each job owns a range of z, slices (s, 2),
-    and meets every ray, so that no two jobs write the same voxel; marks (s, 2 nx ny): see
-    `open_column`.
+    """Apply the transpose of `project_rays` to columns of the chosen views: add to
+    box.flat.
+
+    Each job owns a range of z, slices (s, 2), and meets every ray, so that no two jobs
+    write the same voxel; marks (s, 2 nx ny): see `open_column`. Columns are counted
+    through all chosen views.
     """
     rows, cols = values.shape[1:]
     for job in prange(len(slices)):
@@ -185,7 +198,7 @@ def spread_rays(box, views, chosen, values, slices, marks, first_column, last_co
 
 @inline
 def faces(s, d, n):
-    """t at which the ray s + t d comes into [0, n] and leaves it; never, if d is 0."""
+    """Compute t at which the ray s + t d enters and leaves [0, n]; never, if d is 0."""
     if d > 0.0:
         return -s / d, (n - s) / d
     if d < 0.0:
@@ -195,10 +208,11 @@ def faces(s, d, n):
 
 @kernel
 def walk_jumps(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz):
-    """Walks like `walk_ray` and gathers what the derivatives need.
+    """Walk a ray like `walk_ray` and sum up the terms of its derivatives.
 
     Returns:
-        sum of values times ray parameter; then sum of J and sum of J t over the planes across x,
+        sum of values times ray parameter; then sum of J and sum of J t over the planes
+            across x,
         y and z.
     """
     jx = jy = jz = mx = my = mz = total = 0.0
@@ -277,10 +291,11 @@ def walk_jumps(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz):
 
 @inline
 def ends(total, length, d, jumps, moments):
-    """Derivatives of the line integral with respect to one coordinate of source and of pixel.
+    """Compute derivatives of the line integral by one coordinate of source and of pixel.
 
-    total: sum of values times ray parameter, so that the integral is total * length; d: what the
-    ray covers along this axis [mm]; jumps, moments: sums of J and of J t over its planes.
+    total: sum of values times ray parameter, so that the integral is total * length; d:
+    what the ray covers along this axis [mm]; jumps, moments: sums of J and of J t over
+    its planes.
     """
     stretch = total * d / length  # the ray grows longer
     if d == 0.0:
@@ -290,8 +305,9 @@ def ends(total, length, d, jumps, moments):
 
 @kernel
 def ray_derivatives(box, g, r, c):
-    """Derivatives [1/mm] of the integral of the ray to pixel (r, c) with respect to the source
-    (x, y, z) and to the pixel's centre (x, y, z).
+    """Compute derivatives [1/mm] of the integral of the ray to pixel (r, c).
+
+    They are with respect to the source (x, y, z) and to the pixel's centre (x, y, z).
     """
     dx, dy, dz, length = ray_of(box, g, r, c)
     total, jx, mx, jy, my, jz, mz = walk_jumps(
@@ -356,9 +372,11 @@ def gather(box, views, weights, tile, parts, first_job, last_job):
 
 @parallel
 def follow(box, views, change, tile, out, first_job, last_job):
-    """The transpose of `gather`: what a change (n, 12) [mm] of the views does to each pixel.
+    """Apply the transpose of `gather`: the effect of a view change (n, 12) [mm] on each
+    pixel.
 
-    Fills out (n, rows, cols); each job, `tile` columns of one view, has pixels of its own.
+    Fills out (n, rows, cols); each job, `tile` columns of one view, has pixels of its
+    own.
     """
     _, rows, cols = out.shape
     tiles = (cols + tile - 1) // tile
