@@ -9,19 +9,19 @@ from flexdt.twin.errors import TwinError
 
 
 class DatasetError(TwinError):
-    """Base of all errors about data sets."""
+    """Base class of all errors about data sets."""
 
 
 class DatasetNameError(DatasetError):
-    """A name that could lead outside its folder or that a file system would trip over."""
+    """A name that could lead out of its folder or that a file system may not accept."""
 
 
 class DatasetFormatError(DatasetError):
-    """A file that does not hold what its name says."""
+    """A file whose content is not of the kind that its name states."""
 
 
 class DatasetMissingError(DatasetError):
-    """A file that should be there and is not; names it."""
+    """A required file is missing; the message names it."""
 
 
 class DatasetWriteError(DatasetError):
@@ -29,8 +29,8 @@ class DatasetWriteError(DatasetError):
 
 
 class DiskFullError(DatasetWriteError):
-    """There is no room for a file; nothing of it is left behind."""
+    """There is no space for a file; no part of it is left behind."""
 
 
 class DatasetExistsError(DatasetWriteError):
-    """A data set of that name is there already."""
+    """A data set of that name exists already."""

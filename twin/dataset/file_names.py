@@ -13,14 +13,15 @@ from typing import Final
 from flexdt.twin.dataset.dataset_errors import DatasetNameError
 
 MAX_NAME: Final = 128
-"""Characters of a name."""
+"""Largest number of characters of a name."""
 SCAN_SETTINGS: Final = "scan settings.txt"
 XRE_SETTINGS: Final = "data settings XRE.txt"
 SCRIPT: Final = "script.txt"
 DOCUMENT: Final = "flexdt.json"
 GEOMETRY: Final = "geometry.json"
 UNFINISHED: Final = "unfinished.json"
-"""In a folder that is being saved, or whose saving was interrupted."""
+"""Name of the marker file in a folder that is being saved, or whose saving was
+interrupted."""
 _FORBIDDEN: Final = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|\ud800-\udfff]')
 _DEVICE: Final = re.compile(r"(?:con|prn|aux|nul|com[0-9]|lpt[0-9])(?:\..*)?", re.IGNORECASE)
 
@@ -47,6 +48,7 @@ def plain_name(name: str, what: str = "file") -> str:
 
 
 def _reason(name: str) -> str | None:
+    """Return why a name is not allowed, or None if it is."""
     if not name:
         return "is empty"
     if len(name) > MAX_NAME or len(name.encode("utf-8", "surrogatepass")) > 255:

@@ -38,10 +38,11 @@ from flexdt.twin.script.planning.plan import saved_images
 from flexdt.twin.values import ArrayValue, message_of
 
 SAME = 1e-4
-"""Positions this close are one place [mm, deg]: the texts carry six decimals."""
+"""Largest difference of positions that count as one [mm, deg]: texts have six
+decimals."""
 
 FINITE = ConfigDict(allow_inf_nan=False)
-"""In flexdt.json, where pydantic reads these values, numbers are finite."""
+"""Model configuration that allows finite numbers only in flexdt.json."""
 FrameKind = Literal["dark", "flat", "projection"]
 SCHEMA: Final = 1
 _M = TypeVar("_M", bound=BaseModel)
@@ -173,10 +174,10 @@ class ScanRecord(ArrayValue):
         version: str = "",
         predicted: tuple[PredictedExposure, ...] = (),
     ) -> ScanRecord:
-        """The record of a plan that is about to run; `complete` is False.
+        """Make the record of a plan that is about to run; `complete` is False.
 
-        Settings are those at `write settings file`, or, for a script without that command, those
-        at the first projection.
+        Settings are those at `write settings file`, or, for a script without that
+        command, those at the first projection.
         """
         blocks = tuple(
             FrameBlock(g.kind, g.files, g.starts, g.camera, positions, g.xrays_on)
@@ -232,15 +233,15 @@ class ScanRecord(ArrayValue):
         return tuple(f for b in self.blocks for f in b.files)
 
     def count(self, kind: FrameKind) -> int:
-        """Number of saved images of a kind."""
+        """Count the saved images of a kind."""
         return sum(len(b) for b in self.blocks if b.kind == kind)
 
     def poses_of(self, block: FrameBlock) -> Poses:
-        """Nominal poses of a block's images."""
+        """Compute nominal poses of a block's images."""
         return motor_poses(self.machine, self.profile, block.camera, block.positions)
 
     def cone_vec(self, blocks: Iterable[FrameBlock] | None = None) -> ConeVec:
-        """Nominal geometry of all images, or of some blocks'."""
+        """Compute the nominal geometry of all images, or of some blocks."""
         chosen = self.blocks if blocks is None else tuple(blocks)
         return ConeVec.concatenate([self.poses_of(b).cone_vec() for b in chosen if len(b)])
 
@@ -250,10 +251,12 @@ class ScanRecord(ArrayValue):
         return np.concatenate(parts) if parts else np.zeros(0)
 
     def sections(self) -> int:
-        """How many stretches of projections the texts' one pose and one angle rule cannot join.
+        """Count the sections of projections that the texts' one pose and one angle rule
+        cannot join.
 
-        1 means that the texts alone give the geometry: all motors but the turning one stand where
-        the settings file says, and image i of N lies at first + i * (last - first) / (N - 1).
+        With one section the texts alone give the geometry: all motors but the rotation
+        are where the settings file states, and image i of N is at first + i * (last -
+        first) / (N - 1).
         """
         blocks = [b for b in self.projections if len(b)]
         if not blocks:
@@ -276,12 +279,14 @@ class ScanRecord(ArrayValue):
         return max(2, 1 + int(np.count_nonzero(steps)))
 
     def settings_pose(self) -> Poses:
-        """Nominal pose at the moment of the settings file, n = 1."""
+        """Compute the nominal pose at the time of the settings file, n = 1."""
         return motor_poses(self.machine, self.profile, self.camera, self.positions)
 
 
 def _flat_axis(machine: Machine, blocks: Sequence[FrameBlock]) -> str:
-    """The linear motor that stands farthest from the projections' place during the flats."""
+    """Find the linear motor that is farthest from its place in the projections during
+    flats.
+    """
     flats = next((b for b in blocks if b.kind == "flat"), None)
     scans = next((b for b in blocks if b.kind == "projection"), None)
     if flats is None or scans is None:
@@ -315,7 +320,7 @@ class FrameEntry(_Model):
     file: PlainName
     kind: FrameKind
     time_s: float
-    """Nominal moment on the scan's clock [s]."""
+    """Nominal time on the scan's clock [s]."""
     exposure_ms: float
     averages: int
     mode: str
@@ -328,7 +333,7 @@ class FrameEntry(_Model):
 
     @classmethod
     def all_of(cls, record: ScanRecord, block: FrameBlock) -> Iterator[FrameEntry]:
-        """The entries of a block."""
+        """Yield the entries of a block."""
         rows = record.poses_of(block).cone_vec().rows.tolist()
         times = np.asarray(block.times_s).tolist()
         for i, (file, time, row) in enumerate(zip(block.files, times, rows, strict=True)):
@@ -364,7 +369,7 @@ class TubeEntry(_Model):
 
 
 class CorrectionEntry(_Model):
-    """The correction in force during the scan; parameters in mm and deg."""
+    """The correction applied during the scan; parameters in mm and deg."""
 
     name: str
     date: str
@@ -373,7 +378,7 @@ class CorrectionEntry(_Model):
 
     @classmethod
     def of(cls, correction: NamedCorrection | None) -> CorrectionEntry | None:
-        """The entry of a correction."""
+        """Convert a correction to its entry; None for None."""
         c = correction
         if c is None:
             return None
@@ -381,19 +386,19 @@ class CorrectionEntry(_Model):
 
 
 class PredictedEntry(_Model):
-    """What a setting was predicted to give when the scan was submitted."""
+    """The prediction for one setting when the scan was submitted."""
 
     kV: float
     power_W: float
     exposure_ms: float
     open_beam_fill: float | None = None
-    """Counts of the open beam over the panel's range, saturated from 1; null: not known."""
+    """Counts of the open beam over the panel's range, saturated from 1; null: unknown."""
     saturated: float | None = None
-    """Part of the projections' pixels; null: not known."""
+    """Share of saturated pixels of the projections; null: unknown."""
     starved: float | None = None
-    """Part of the projections' pixels; null: not known."""
+    """Share of starved pixels of the projections; null: unknown."""
     doubts: list[str] = Field(default_factory=list)
-    """What the prediction says against the setting."""
+    """Warnings of the prediction about the setting."""
 
     @classmethod
     def of(cls, predicted: PredictedExposure) -> PredictedEntry:
@@ -420,7 +425,7 @@ class DatasetDocument(_Model):
 
     schema_version: Literal[1] = Field(alias="schema")
     flexdt: str = ""
-    """Version of the software that wrote it."""
+    """Version of the software that wrote the file."""
     name: str
     started: datetime
     duration_s: float
@@ -428,7 +433,7 @@ class DatasetDocument(_Model):
     smooth: bool = True
     complete: bool = False
     reason: str = ""
-    """Why it is not complete."""
+    """Reason why the scan is not complete."""
     machine: dict[str, Any]
     profile: dict[str, Any]
     tube: TubeEntry
@@ -444,7 +449,7 @@ class DatasetDocument(_Model):
 
     @classmethod
     def of(cls, record: ScanRecord) -> DatasetDocument:
-        """The document of a scan."""
+        """Make the document of a scan."""
         camera = record.camera
         rows, cols = camera.shape
         return cls(
@@ -478,7 +483,7 @@ class DatasetDocument(_Model):
         )
 
     def to_json(self) -> str:
-        """As text: one line for each frame, so that people and diffs can read it."""
+        """Write the document as text, one line a frame, for people and diffs."""
         head = self.model_dump(mode="json", by_alias=True, exclude={"frames"})
         text = json.dumps(head, indent=1, ensure_ascii=False)
         lines = [json.dumps(f.model_dump(mode="json"), ensure_ascii=False) for f in self.frames]
@@ -486,29 +491,29 @@ class DatasetDocument(_Model):
         return f'{text[:-2]},\n "frames": [\n  {frames}\n ]\n}}\n'
 
     def cone_vec(self, kind: FrameKind | None = "projection") -> ConeVec:
-        """Nominal geometry of the frames of one kind, or of all."""
+        """Read the nominal geometry of the frames of one kind, or of all."""
         rows = [f.cone_vec for f in self.frames if kind is None or f.kind == kind]
         return ConeVec(np.array(rows, dtype=np.float64).reshape(-1, 12))
 
     def positions(self, kind: FrameKind = "projection") -> dict[str, FloatArray]:
-        """Motor -> (n,) positions of the frames of one kind [mm, deg]."""
+        """Read motor positions of the frames of one kind: motor -> (n,) [mm, deg]."""
         chosen = [f.positions for f in self.frames if f.kind == kind]
         return {n: np.array([p[n] for p in chosen]) for n in (chosen[0] if chosen else {})}
 
     def files(self, kind: FrameKind) -> tuple[str, ...]:
-        """File names of one kind, in the order taken."""
+        """List file names of one kind, in the order taken."""
         return tuple(f.file for f in self.frames if f.kind == kind)
 
     def shapes(self, kind: FrameKind = "projection") -> list[tuple[int, int]]:
-        """Image (rows, cols) of each frame of one kind.
+        """List the image shape (rows, cols) of each frame of one kind.
 
         Raises:
-            LimitError: a camera mode that is none.
+            LimitError: a camera mode does not exist.
         """
         return [self.shape_of(f) for f in self.frames if f.kind == kind]
 
     def shape_of(self, frame: FrameEntry) -> tuple[int, int]:
-        """Image (rows, cols) of one frame; raises as `shapes`."""
+        """Return the image shape (rows, cols) of one frame; raises as `shapes`."""
         return self._camera(frame).shape
 
     def _camera(self, entry: FrameEntry | DetectorEntry) -> CameraSettings:
@@ -519,10 +524,10 @@ class DatasetDocument(_Model):
         return CameraSettings(entry.mode, roi, entry.exposure_ms, entry.averages, modes=modes)
 
     def poses(self, machine: Machine, profile: Profile, kind: FrameKind = "projection") -> Poses:
-        """Nominal poses of the frames of one kind, from their motor positions.
+        """Compute nominal poses of the frames of one kind from their motor positions.
 
         Raises:
-            TwinError: a motor that `machine` does not have, a camera mode that is none.
+            TwinError: `machine` does not have a motor, or a camera mode does not exist.
         """
         chosen = [f for f in self.frames if f.kind == kind]
         parts = []
@@ -538,22 +543,22 @@ class DatasetDocument(_Model):
         return Poses.concatenate(parts)
 
     def correction_in_force(self) -> NamedCorrection | None:
-        """The correction, in internal units."""
+        """Return the applied correction in internal units, or None."""
         c = self.correction
         return (
             None if c is None else NamedCorrection.from_edge(c.name, c.date, c.parameters, c.note)
         )
 
     def machine_of(self, file: str = DOCUMENT) -> Machine:
-        """The scanner.
+        """Read the scanner's description.
 
         Raises:
-            DatasetFormatError: it does not describe one.
+            DatasetFormatError: it is not valid; `file` is named.
         """
         return _validated(Machine, self.machine, f"{file}: machine")
 
     def profile_of(self, file: str = DOCUMENT) -> Profile:
-        """The zero offsets; raises as `machine_of`."""
+        """Read the profile of zero offsets; raises as `machine_of`."""
         return _validated(Profile, self.profile, f"{file}: profile")
 
 
@@ -576,6 +581,11 @@ def parse_document(text: str, file: str = DOCUMENT) -> DatasetDocument:
 
 
 def _validated(model: type[_M], content: object, file: str) -> _M:
+    """Validate content of `file` as a model.
+
+    Raises:
+        DatasetFormatError: the content does not fit; names file, key and value.
+    """
     try:
         return model.model_validate(content)
     except ValidationError as error:

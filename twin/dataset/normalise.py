@@ -18,25 +18,17 @@ from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.geometry.conventions import Float32Array
 
 MIN_FLAT: Final = 1.0
-"""Counts above dark below which a pixel of the flat is dead."""
+"""Least counts above dark of a live pixel of the flat."""
 MIN_COUNTS: Final = 0.5
-"""Counts above dark that a pixel without signal is taken to have."""
+"""Counts above dark that are assumed for a pixel without signal."""
 
 LEAST_LIGHT: Final = 1e-6
-"""Open beam that a pixel of images on another scale has at least, as a share of the brightest."""
+"""Least open beam of a pixel of images on another scale, as a share of the brightest."""
 
 
 @dataclass(frozen=True, eq=False)
 class LineIntegrals:
-    """The normalisation of one data set.
-
-    Attributes:
-        dark: mean dark image, (rows, cols) [counts].
-        log_open: log of the open beam f - d, (rows, cols); 0 where dead.
-        dead: mask of dead pixels, and of those that are interpolated as they are.
-        before, after: flat indices of the live pixels between which each of these is interpolated.
-        weight: of the latter.
-    """
+    """Converts counts of one data set to line integrals."""
 
     dark: Float32Array
     log_open: Float32Array
@@ -47,7 +39,7 @@ class LineIntegrals:
 
     @classmethod
     def of(cls, dark: Float32Array, flat: Float32Array) -> LineIntegrals:
-        """From mean dark and flat images.
+        """Prepare the conversion from mean dark and flat images (rows, cols) [counts].
 
         Raises:
             DatasetFormatError: no pixel of the flat is brighter than the dark image.
@@ -62,14 +54,16 @@ class LineIntegrals:
         return cls(np.asarray(dark, dtype=np.float32), log_open, dead, *_neighbours(dead))
 
     def interpolating(self, mask: npt.NDArray[np.bool_]) -> LineIntegrals:
-        """The same with more pixels (rows, cols) interpolated, unless none would be left."""
+        """Return a copy that interpolates more pixels (rows, cols), unless none would be
+        left.
+        """
         dead = self.dead | mask
         if dead.all():
             return self
         return LineIntegrals(self.dark, self.log_open, dead, *_neighbours(dead))
 
     def __call__(self, counts: npt.NDArray[np.generic]) -> Float32Array:
-        """Line integrals of one image of counts, float32 (rows, cols), finite."""
+        """Convert an image of counts to line integrals, float32 (rows, cols), finite."""
         out: Float32Array = np.subtract(counts, self.dark, dtype=np.float32)
         np.maximum(out, np.float32(MIN_COUNTS), out=out)
         np.log(out, out=out)
@@ -85,13 +79,18 @@ class LineIntegrals:
 def of_intensities(
     images: npt.NDArray[Any], dark: npt.NDArray[Any] | float, flat: npt.NDArray[Any]
 ) -> Float32Array:
-    """Line integrals of images that are no whole numbers of counts: dark-subtracted, averaged or
-    scaled ones, such as transmissions with a flat image of ones.
+    """Convert images that are not whole counts to line integrals.
+
+    Such images are dark-subtracted, averaged or scaled, or transmissions with a flat
+    image of ones.
 
     Args:
-        images: (n, rows, cols), of any scale, below the dark image where noise makes them so.
+        images: (n, rows, cols), of any scale; noise may bring them below the dark image.
         dark: mean dark image (rows, cols), or one value, on the same scale.
         flat: mean flat image (rows, cols), on the same scale.
+
+    Returns:
+        float32 (n, rows, cols).
     """
     opened = np.maximum(flat - dark, LEAST_LIGHT * np.max(flat))
     light = (np.asarray(images, dtype=np.float32) - dark) / opened
@@ -101,8 +100,12 @@ def of_intensities(
 def _neighbours(
     dead: npt.NDArray[np.bool_],
 ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], Float32Array]:
-    """Flat indices of the live pixels before and after each dead one in its row, and the weight of
-    the latter; of the nearest of all where a row has none on one side.
+    """Find the live pixels before and after each dead one in its row.
+
+    A row without a live pixel on one side uses the nearest one.
+
+    Returns:
+        flat indices of both, and the weight of the latter.
     """
     if not dead.any():
         none = np.empty(0, dtype=np.intp)
@@ -124,11 +127,11 @@ def _neighbours(
 
 
 def binned_mean(images: npt.NDArray[Any], factor: int | tuple[int, int]) -> npt.NDArray[Any]:
-    """Mean over blocks of pixels; surplus rows and columns are cut off.
+    """Average over blocks of pixels; surplus rows and columns are cut off.
 
     Args:
         images: (..., rows, cols).
-        factor: pixels a side of a block; or its rows and columns.
+        factor: pixels along each edge of a block, or its rows and columns.
     """
     down, across = (factor, factor) if isinstance(factor, int) else factor
     if down == across == 1:

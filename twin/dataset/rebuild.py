@@ -25,19 +25,12 @@ from flexdt.twin.machine.kinematics import motor_poses
 
 MATCH_MM: Final = 0.01
 MATCH_PX: Final = 0.05
-"""How close a profile must come to the printed figures (they carry six decimals; motors less)."""
+"""Largest deviation of a matching profile from the printed figures [px]."""
 
 
 @dataclass(frozen=True)
 class Rebuilt:
-    """Geometry from texts.
-
-    Attributes:
-        poses: nominal, one for each image.
-        machine, profile: what they were built with; None where the figures alone were used.
-        positions: motor -> (n,) positions [mm, deg], script's sign; empty without a machine.
-        notes: how it was decided, for people.
-    """
+    """Geometry computed from texts."""
 
     poses: Poses
     machine: Machine | None
@@ -78,7 +71,7 @@ def rebuild(
     *,
     file: str = "scan settings.txt",
 ) -> Rebuilt:
-    """Poses of images 0 to count - 1.
+    """Compute poses of images 0 to count - 1 from the scanner's texts.
 
     Args:
         settings: read from the texts.
@@ -171,7 +164,11 @@ def _profile(
     positions: Mapping[str, FloatArray],
     printed: Figures | None,
 ) -> tuple[Profile, str] | None:
-    """The profile asked for, or the one that reproduces the printed figures, and why."""
+    """Choose the given profile, or the one that reproduces the printed figures.
+
+    Returns:
+        the profile and the reason for the choice; None if no profile fits.
+    """
     if len(profiles) == 1:
         return profiles[0], ": as asked"
     if printed is None:
@@ -188,7 +185,11 @@ def _profile(
 
 
 def named_machine(settings: ScanSettings, machines: Sequence[Machine]) -> Machine | None:
-    """The candidate whose scanner name or type the texts name and whose motors they have."""
+    """Find the machine that the texts name or, without a name, whose motors they list.
+
+    Returns:
+        None if no machine fits, or several by their motors.
+    """
     said = {_word(settings.scanner_name), _word(settings.scanner_type)} - {""}
     for machine in machines:
         names = {_word(machine.scanner_name), _word(machine.scanner_type), _word(machine.name)}
@@ -207,7 +208,11 @@ def _word(text: str | None) -> str:
 def _positions(
     settings: ScanSettings, machine: Machine, angles: FloatArray
 ) -> tuple[dict[str, FloatArray], list[str]]:
-    """Motor positions in the script's sign; the rotation follows the angle rule."""
+    """Compute motor positions in the script's sign, with the rotation by the angle rule.
+
+    Returns:
+        motor -> (n,) positions [mm, deg], and notes for the user.
+    """
     notes = []
     out = {}
     turning = machine.geometry.get("angle", {})
@@ -225,7 +230,7 @@ def _positions(
 def _camera(
     settings: ScanSettings, shape: tuple[int, int], file: str, modes: tuple[tuple[str, int], ...]
 ) -> CameraSettings | None:
-    """Camera settings that give images of `shape`; None if the texts do not state them."""
+    """Compute camera settings for images of `shape`; None if the texts do not state them."""
     if settings.roi is None or settings.mode is None:
         return None
     try:

@@ -18,7 +18,7 @@ from flexdt.twin.dataset.stated_geometry import Figures, figures_of
 from flexdt.twin.machine.camera import Roi
 
 Kind = Literal["text", "number", "count", "mm", "minutes", "whole minutes", "roi"]
-"""How a value is written."""
+"""Name of the form in which a value is written."""
 _SCAN, _SAMPLE, _TUBE = "Scan info", "Sample info", "Tube settings"
 _CAMERA, _ACQUISITION, _CT = "Camera settings", "Acquisition settings", "CT-parameters IN"
 _ORDER = ("mag_obj", "mag_det", "rot_obj", "tra_obj", "tra_det", "tra_tube", "ver_tube", "ver_det")
@@ -63,7 +63,9 @@ _total = partial(_count, separator=": ")
 
 @dataclass(frozen=True)
 class ScanSettings:
-    """Everything `scan settings.txt` says, in its order; names follow its keys, units its units."""
+    """Content of `scan settings.txt` in its order; names follow its keys, units its
+    units.
+    """
 
     scan_id: str | None = _text("ScanID", _SCAN, "scanID")
     batch_id: str | None = _text("BatchID")
@@ -125,7 +127,7 @@ class ScanSettings:
 
     @property
     def figures(self) -> Figures | None:
-        """SOD, SDD, HC, VC, COR and pixel, if all are there."""
+        """SOD, SDD, HC, VC, COR and pixel, if all are stated, else None."""
         values = (
             self.sod_mm, self.sdd_mm, self.hc_px, self.vc_px, self.cor_px, self.binned_pixel_mm,
         )  # fmt: skip
@@ -136,14 +138,15 @@ class ScanSettings:
 ENTRIES: Final[Mapping[str, Entry]] = {
     f.name: f.metadata["entry"] for f in fields(ScanSettings) if "entry" in f.metadata
 }
-"""Field -> where it is stated; the other fields have forms of their own."""
+"""Field -> place where it is stated; the other fields have their own forms."""
 
 
 def settings_of(record: ScanRecord) -> ScanSettings:
-    """The settings file's content for a scan.
+    """Compute the settings file's content for a scan.
 
-    Counts of flats and offset images are exposures, as the scanner counts them: a flat averaged
-    over 30 exposures counts 30. Start and last angle are those of the first and last projection.
+    Counts of flats and offset images are exposures, as the scanner counts them: a flat
+    averaged over 30 exposures counts 30. Start and last angle are those of the first and
+    last projection.
     """
     camera, machine = record.camera, record.machine
     figures = figures_of(record.settings_pose(), camera.shape)
@@ -202,7 +205,7 @@ def settings_of(record: ScanRecord) -> ScanSettings:
 
 
 def motor_lines(record: ScanRecord) -> dict[str, MotorLine]:
-    """Axis -> its line, virtual axes first, in the settings file's sign."""
+    """List axis -> its line, virtual axes first, in the settings file's sign."""
     out: dict[str, MotorLine] = {}
     machine = record.machine
     for name, virtual in machine.virtual_axes.items():
@@ -216,7 +219,7 @@ def motor_lines(record: ScanRecord) -> dict[str, MotorLine]:
 
 
 def _place(name: str) -> tuple[int, str]:
-    """The order of the scanner's own files; axes they do not have come last."""
+    """Return the sort key of the scanner's own order of axes; unknown axes come last."""
     return (_ORDER.index(name) if name in _ORDER else len(_ORDER), name)
 
 

@@ -35,7 +35,7 @@ _BEFORE: Final[Mapping[str, tuple[str, ...]]] = {
     "tube": ("", ""),
     "scan_type": ("Script summary:", ""),
 }
-"""Lines that come before a field's own, also where that is absent."""
+"""Field -> lines written before its own, even if that is absent."""
 _BY_KEY: Final = {entry.key.lower(): field for field, entry in ENTRIES.items() if entry.key}
 _MOTOR_WORD: Final = re.compile(r"[A-Za-z][A-Za-z0-9_ ]*")
 _EVERY: Final = re.compile(r"reference images every\s+(\d+)\s+projections", re.IGNORECASE)
@@ -46,15 +46,16 @@ _DATE_FORMATS: Final = (
 
 
 def clean(text: str) -> str:
-    """One line of text: control characters and line breaks become blanks, ends are stripped."""
+    """Reduce text to one line: control characters become blanks, ends are stripped."""
     return _CONTROL.sub(" ", text).strip()
 
 
 def parse_number(text: str) -> float:
-    """A finite number as scanners print it: `1.5`, `1,5`, `1.5;`, `1.5 mm`, `874.6E-9`.
+    """Read a finite number as scanners print it: `1.5`, `1,5`, `1.5;`, `1.5 mm`,
+    `874.6E-9`.
 
     Raises:
-        ValueError: it is none.
+        ValueError: it is not a number.
     """
     word = text.strip().rstrip(";").strip().split(" ")[0]
     if word.count(",") == 1 and "." not in word:
@@ -73,7 +74,7 @@ def _whole(text: str) -> int:
 
 
 def parse_roi(text: str) -> Roi:
-    """Four whole numbers, left, top, right, bottom, separated by anything.
+    """Read four whole numbers, left, top, right, bottom, with any separators.
 
     Raises:
         ValueError: there are not four.
@@ -94,11 +95,11 @@ _KINDS: Final[Mapping[Kind, tuple[Callable[[Any], str], Callable[[str], object]]
     "whole minutes": (lambda v: f"{v:d} minutes", _whole),
     "roi": (lambda v: f"{v.left},{v.top},{v.right},{v.bottom}", parse_roi),
 }
-"""How a value is written and read; reading may raise ValueError."""
+"""Form -> functions that write and read a value; reading may raise ValueError."""
 
 
 def format_scan_settings(scan: ScanRecord | ScanSettings) -> str:
-    """The text of `scan settings.txt` (CRLF) for a scan; absent fields leave their line out."""
+    """Write `scan settings.txt` (CRLF) for a scan; absent fields have no line."""
     s = settings_of(scan) if isinstance(scan, ScanRecord) else scan
     out: list[str] = []
     for name in (f.name for f in fields(ScanSettings)):
@@ -174,6 +175,10 @@ def parse_scan_settings(text: str, file: str = SCAN_SETTINGS) -> ScanSettings:
 def _read_line(
     line: str, rest: list[str], values: dict[str, Any], motors: dict[str, MotorLine]
 ) -> None:
+    """Read one line into `values` or `motors`.
+
+    A date or a scan type may follow in `rest`, the lines after it.
+    """
     upper = line.upper()
     if upper in (_START, _STOP):
         following = next((other for other in rest if other), "")
@@ -200,7 +205,9 @@ def _read_line(
 
 
 def _split(line: str) -> tuple[str | None, str]:
-    """(lower-cased key, value) at the first `:` or `=`; (None, line) without one."""
+    """Split at the first `:` or `=` into (lower-cased key, value); (None, line) without
+    one.
+    """
     at = min((i for i in (line.find(":"), line.find("=")) if i >= 0), default=-1)
     if at < 0:
         return None, line
@@ -217,7 +224,10 @@ def _read_field(field: str, value: str, values: dict[str, Any]) -> None:
 
 
 def _is_motor(key: str, value: str) -> bool:
-    """A line with a speed is a motor; so is a bare number behind a name with an underscore."""
+    """Return whether a line describes a motor.
+
+    It does if it has a speed, or a bare number after a name with an underscore.
+    """
     if _MOTOR_WORD.fullmatch(key) is None:
         return False
     if re.search(r";\s*speed\s*[:=]", value, re.IGNORECASE):
@@ -236,7 +246,7 @@ def _read_motor(value: str) -> MotorLine:
 
 
 def _moment(line: str) -> datetime | None:
-    """A date line's moment; None if it has another form (dates never decide anything)."""
+    """Read a date line; None for another form (dates never decide anything)."""
     found = _DATE.match(line)
     if found is None:
         return None

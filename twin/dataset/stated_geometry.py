@@ -16,19 +16,12 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.poses import Poses
 
 EDGE = 0.5
-"""Edge-measured coordinate of the centre of pixel 0."""
+"""Coordinate of the centre of pixel 0, measured from the edge [px]."""
 
 
 @dataclass(frozen=True)
 class Figures:
-    """A geometry as the settings texts state it.
-
-    Attributes:
-        sod_mm, sdd_mm: source-object and source-detector distance along the beam.
-        hc_px, vc_px: piercing point (column, row) from the edge, binned pixels.
-        cor_px: column of the rotation axis at the height of the focal spot, from the edge.
-        pixel_mm: binned pixel pitch.
-    """
+    """A geometry as stated in the settings texts."""
 
     sod_mm: float
     sdd_mm: float
@@ -44,7 +37,7 @@ class Figures:
 
     @property
     def stated(self) -> dict[str, Any]:
-        """The members of `ScanSettings` that say it."""
+        """The corresponding members of `ScanSettings`."""
         numbers = {name: value for name, value in vars(self).items() if name != "pixel_mm"}
         return {
             **numbers, "binned_pixel_mm": self.pixel_mm, "voxel_um": self.voxel_um,
@@ -58,7 +51,7 @@ class Figures:
 
 
 def figures_of(pose: Poses, shape: tuple[int, int]) -> Figures:
-    """The figures of one pose (n = 1) on an image of `shape` (rows, cols)."""
+    """Compute the figures of one pose (n = 1) on an image of `shape` (rows, cols)."""
     cone = pose.cone_vec()
     hc, vc = (cone.piercing_points(shape)[0] + EDGE).tolist()
     height = float(pose.source[0, 2] - pose.axis[0, 2])
@@ -77,9 +70,10 @@ def poses_of(
     source_z: float = 0.0,
     axis_z: float = 0.0,
 ) -> Poses:
-    """Poses that have these figures, with an upright detector; the inverse of `figures_of`.
+    """Compute poses with these figures and an upright detector; the inverse of
+    `figures_of`.
 
-    The figures leave open where the scanner's origin lies and how high the sample stands, so those
+    The figures do not determine the scanner's origin and the sample's height, so those
     are arguments.
 
     Args:

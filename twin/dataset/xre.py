@@ -27,14 +27,14 @@ Sections = Mapping[str, Mapping[str, Value]]
 # the twin does not model has no entry.
 _NOWHERE: Final = (0.0, 0.0, 0.0)
 _TALL_MM: Final = 2000.0
-"""Height of the sample where the scanner was told none."""
+"""Height of the sample when the record has none [mm]."""
 
 
 def format_xre(record: ScanRecord) -> str:
-    """The text of `data settings XRE.txt` (CRLF) for a scan: `data/texts/xre.txt`, filled in.
+    """Write `data settings XRE.txt` (CRLF) for a scan: `data/texts/xre.txt`, filled in.
 
-    Values of the maker's reconstruction and of hardware the twin does not model are zero or empty
-    there, so that readers find every key.
+    Values of the maker's reconstruction and of hardware the twin does not model are zero
+    or empty there, so that readers find every key.
     """
     s, camera = settings_of(record), record.camera
     rotation = next(iter(record.machine.geometry.get("angle", {"rot_obj": 1.0})))
@@ -81,17 +81,17 @@ def format_xre(record: ScanRecord) -> str:
 
 
 class _Filled(string.Formatter):
-    """Values as this file writes them; mappings are lines."""
+    """Formatter of values for this file; mappings become lines."""
 
     def format_field(self, value: Any, format_spec: str) -> str:
-        """A value, by its type."""
+        """Format a value by its type."""
         if format_spec:
             return format(value, format_spec)
         return _lines(value) if isinstance(value, Mapping) else _written(value)
 
 
 def format_settings(settings: ScanSettings) -> str:
-    """The text of `data settings XRE.txt` as far as `XreSettings.settings` would read it."""
+    """Write as much of `data settings XRE.txt` as `XreSettings.settings` would read."""
     sections: dict[str, dict[str, Value]] = {}
     for field, entry in ENTRIES.items():
         value = getattr(settings, field)
@@ -102,7 +102,7 @@ def format_settings(settings: ScanSettings) -> str:
 
 
 def format_sections(sections: Sections) -> str:
-    """Sections as text: quoted texts, TRUE and FALSE, `%d` and `%f` numbers."""
+    """Write sections as text: quoted texts, TRUE and FALSE, `%d` and `%f` numbers."""
     blocks = [f"[{clean(name)}]{EOL}{_lines(entries)}" for name, entries in sections.items()]
     return (EOL + EOL).join(block.strip() for block in blocks) + EOL
 
@@ -163,6 +163,7 @@ def _entry(
     track: bool = False,
     safe: bool = True,
 ) -> str:
+    """Write one position of source, detector or object with its axes."""
     return (
         f"WC{_triple(place)}dirX{_triple(x)}dirY{_triple(y)}dirZ{_triple(z)}radius[{radius:f}]"
         f"height[{height:f}]track[{str(track).upper()}]safe range?[{str(safe).upper()}]"
@@ -171,17 +172,18 @@ def _entry(
 
 
 def _word(name: str) -> str:
-    """A name as part of a key: what would end the key is left out."""
+    """Remove from a name the characters that would end a key."""
     return "".join(c for c in name if c.isprintable() and c not in '=:[]"')
 
 
 def _triple(vector: Sequence[float] | FloatArray) -> str:
-    """Four decimals at most, without trailing zeros and minus zero."""
+    """Format a vector with up to four decimals, without trailing zeros and minus zero."""
     texts = [f"{value:.4f}".rstrip("0").rstrip(".") for value in vector]
     return f"[{';'.join('0' if text in ('-0', '') else text for text in texts)}]"
 
 
 def _written(value: Value) -> str:
+    """Format one value by its type."""
     match value:
         case bool():
             return "TRUE" if value else "FALSE"

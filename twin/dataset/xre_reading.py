@@ -23,14 +23,16 @@ class XreSettings:
     sections: Mapping[str, Mapping[str, str]]
 
     def text(self, section: str, key: str) -> str | None:
-        """A value's text, any case of section and key; None where it is absent or empty."""
+        """Return a value's text for a section and key in any case; None if absent or
+        empty.
+        """
         return next((v for k, v in self._entries(section) if k.lower() == key.lower() and v), None)
 
     def number(self, section: str, key: str) -> float | None:
-        """A value as a number; None where it is absent.
+        """Return a value as a number; None if absent.
 
         Raises:
-            DatasetFormatError: it is there and is no number.
+            DatasetFormatError: it is present and not a number.
         """
         text = self.text(section, key)
         if text is None:
@@ -42,10 +44,10 @@ class XreSettings:
 
     @property
     def settings(self) -> ScanSettings:
-        """What `scan settings.txt` would say, as far as this file says it.
+        """The corresponding content of `scan settings.txt`, as far as this file has it.
 
         Raises:
-            DatasetFormatError: a figure is no number.
+            DatasetFormatError: a figure is not a number.
         """
         roi = self.text("Camera settings", "ROI")
         motors = {
@@ -76,7 +78,9 @@ class XreSettings:
 
     @property
     def one_circle(self) -> bool:
-        """Whether one pose and one angle rule describe the whole scan (True if it does not say)."""
+        """True if one pose and one angle rule describe the scan, or if that is not
+        stated.
+        """
         sections = self.number("Acquisition settings", "nr of sections")
         return sections is None or sections <= 1.0
 

@@ -34,17 +34,17 @@ POSES: Final = (SOURCE, DETECTOR, COLUMNS, ROWS)
 PANEL: Final = ("num_pixels", "pixel_size", "origin")
 """Arguments of `set_panel`; counts and sizes along columns come first."""
 ORIGIN: Final = "top-left"
-"""Where our first pixel is."""
+"""CIL's name for the corner of our first pixel."""
 ORIGINS: Final = {"top-left": (1, -1), "top-right": (-1, -1),
                   "bottom-left": (1, 1), "bottom-right": (-1, 1)}  # fmt: skip
 """Origin of the data -> signs of our u and v along CIL's directions x and y."""
 
 
 def cil_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
-    """The arguments by name.
+    """Convert a geometry to CIL's arguments by name: `POSES`, `PANEL`.
 
     Raises:
-        ExchangeError: skew pixels, several pixel sizes, or no shape.
+        ExchangeError: skew pixels, several pixel sizes, or an unknown shape.
     """
     rows, columns = require_shape(geometry, "CIL")
     pitch_u, pitch_v = require_panel(geometry.cone_vec, "CIL")
@@ -61,10 +61,10 @@ def cil_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
 
 
 def read_cil(arrays: Arrays, file: str = "<npz>") -> ScanGeometry:
-    """The geometry of these arguments.
+    """Convert CIL's arguments to a geometry.
 
     Raises:
-        ExchangeError: one is missing, or does not hold.
+        ExchangeError: an argument is missing or not valid.
     """
     require_names(arrays, (*POSES, *PANEL), file)
     source, detector = vectors_of(arrays, (SOURCE, DETECTOR), file)

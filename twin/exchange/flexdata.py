@@ -25,10 +25,10 @@ from flexdt.twin.plausibility.scan_geometry import distance_findings
 
 VERSION: Final = "0.1.0"
 ROUNDED_MM: Final = 1e-4
-"""How far any number of a view may lie beside what the format states: scripts of step scans write
-angles with six decimals, which is some 1e-5 mm."""
+"""Largest deviation of any number of a view from the format's value [mm]. Scripts of
+step scans write angles with six decimals, which is some 1e-5 mm."""
 UNSUPPORTED: Final = ("axs_roll", "axs_pitch", "vol_rot")
-"""Numbers of the format that must be zero to be read: see the documentation."""
+"""Names of the format's numbers that must be zero to be read; see the documentation."""
 _NUMBERS: Final[Mapping[str, Any]] = {
     **dict.fromkeys(("src2obj", "det2obj", "src2det"), math.nan),
     **dict.fromkeys(("det_rows", "det_cols", "det_pixel"), math.nan),
@@ -37,17 +37,17 @@ _NUMBERS: Final[Mapping[str, Any]] = {
     **dict.fromkeys(("src_tan", "src_ort", "det_tan", "det_ort", "axs_tan"), 0.0),
     **dict.fromkeys(("axs_roll", "axs_pitch", "det_roll", "det_yaw", "det_pitch"), 0.0),
 }  # fmt: skip
-"""What is read: name -> values where there are none, of as many as it must have."""
+"""Name -> default values, as many as a file must give."""
 
 
 def flexdata_text(geometry: ScanGeometry) -> str:
-    """The TOML, for images turned upside down.
+    """Write the TOML file for images turned upside down.
 
     Args:
-        geometry: of the images as they are.
+        geometry: of the images before they are turned.
 
     Raises:
-        ExchangeError: a geometry that the format cannot state.
+        ExchangeError: the format cannot express the geometry.
     """
     up = geometry.rows_up()
     pitch_u, pitch_v = g.require_panel(up.cone_vec, "flexDATA")
@@ -96,7 +96,9 @@ def flexdata_text(geometry: ScanGeometry) -> str:
 
 
 def _angles(axes: FloatArray) -> tuple[float, float, float]:
-    """Roll about y, then yaw about the turned z, then pitch about the turned x [rad]."""
+    """Compute roll about y, then yaw about the turned z, then pitch about the turned x
+    [rad].
+    """
     yaw = math.asin(max(-1.0, min(1.0, axes[1, 0])))
     if math.hypot(axes[0, 0], axes[2, 0]) < 1e-9:
         raise ExchangeError(
@@ -164,7 +166,7 @@ def read_flexdata(
 
 
 def _values(name: str, records: Mapping[str, Any], file: str) -> FloatArray:
-    """One of `_NUMBERS`, of the file or as it is where there is none."""
+    """Read one of `_NUMBERS` from a file, or its default if absent."""
     usual = np.array(_NUMBERS[name])
     given = records.get(name, usual.tolist())
     each = given if isinstance(given, list) else [given]

@@ -19,13 +19,15 @@ from flexdt.twin.geometry.conventions import FloatArray, rotation_z
 from flexdt.twin.geometry.poses import Poses
 
 SAME_MM: Final = 1e-9
-"""What a format that is to carry a geometry may lose of it [mm]."""
+"""Largest error of a geometry in an exchange format [mm]."""
 SQUARE: Final = 1e-9
-"""Largest cosine of u and v, and relative difference of pitches, taken for none."""
+"""Largest cosine of u and v, and relative difference of pitches, that count as zero."""
 
 
 class ExchangeError(TwinError):
-    """A file that does not hold, or a geometry that a format cannot carry: what, where, why."""
+    """A file that is not valid, or a geometry that a format cannot carry: what, where,
+    why.
+    """
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ class ScanGeometry:
         return float(np.linalg.norm(first[6:9])), float(np.linalg.norm(first[9:12]))
 
     def rows_up(self) -> ScanGeometry:
-        """The same detector with its rows counted from the other side: v is negated.
+        """Return the detector with rows counted from the other side: v is negated.
 
         It belongs to images that are turned upside down.
         """
@@ -96,7 +98,7 @@ class CircularScan:
     v: FloatArray
 
     def cone_vec(self) -> ConeVec:
-        """The views of the circle."""
+        """Compute the views of the circle."""
         standing = np.concatenate([self.source, self.detector, self.u, self.v])
         return ConeVec(np.tile(standing, (len(self.angle), 1))).moved(
             rotation_z(self.angle), np.array([*self.center, 0.0])
@@ -104,15 +106,15 @@ class CircularScan:
 
 
 def circle_of(cone_vec: ConeVec, format_name: str, tolerance_mm: float = SAME_MM) -> CircularScan:
-    """The circle that `cone_vec` is.
+    """Find the circle that `cone_vec` describes.
 
     Args:
         cone_vec: at least one view.
-        format_name: who asks, for the message.
-        tolerance_mm: how far any number of a view may lie beside the circle.
+        format_name: format that needs a circle, for the message.
+        tolerance_mm: largest deviation of any number of a view from the circle.
 
     Raises:
-        ExchangeError: it is none; says in which view and by how much.
+        ExchangeError: it is not a circle; names the view and its deviation.
     """
     poses = Poses.from_cone_vec(cone_vec)
     angle = poses.angle
@@ -137,7 +139,7 @@ def circle_of(cone_vec: ConeVec, format_name: str, tolerance_mm: float = SAME_MM
 
 
 def require_panel(cone_vec: ConeVec, format_name: str) -> tuple[float, float]:
-    """The pixel pitch (u, v) [mm] of a panel whose pixels are rectangles of one size.
+    """Return the pixel pitch (u, v) [mm] of a panel with rectangular pixels of one size.
 
     Raises:
         ExchangeError: u and v are not orthogonal, or their lengths vary; names the view.

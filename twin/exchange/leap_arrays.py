@@ -40,10 +40,10 @@ NAMES: Final = (*COUNTS, *SIZES, SOURCE, DETECTOR, ROWS, COLUMNS)
 
 
 def leap_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
-    """The arguments by name, in double precision.
+    """Convert a geometry to LEAP's arguments by name, in double precision.
 
     Raises:
-        ExchangeError: skew pixels, several pixel sizes, or no shape.
+        ExchangeError: skew pixels, several pixel sizes, or an unknown shape.
     """
     rows, columns = require_shape(geometry, "LEAP")
     pitch_u, pitch_v = require_panel(geometry.cone_vec, "LEAP")
@@ -55,10 +55,10 @@ def leap_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
 
 
 def read_leap(arrays: Arrays, file: str = "<npz>") -> ScanGeometry:
-    """The geometry of these arguments.
+    """Convert LEAP's arguments to a geometry.
 
     Raises:
-        ExchangeError: one is missing, or does not hold.
+        ExchangeError: an argument is missing or not valid.
     """
     require_names(arrays, NAMES, file)
     views, rows, columns = (counts_of(arrays, name, file, ())[0] for name in COUNTS)

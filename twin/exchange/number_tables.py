@@ -34,12 +34,13 @@ Texts = Annotated[tuple[str, ...], Field(strict=False)]
 
 
 def vectors_text(geometry: ScanGeometry) -> str:
-    """ASTRA's cone_vec, twelve numbers a line."""
+    """Write ASTRA's cone_vec, twelve numbers a line."""
     return "".join(" ".join(map(repr, row)) + "\n" for row in geometry.cone_vec.rows.tolist())
 
 
 def read_vectors_text(text: str, file: str = "<text>") -> ConeVec:
-    """Twelve numbers a line, between blanks, tabs, commas or semicolons; # begins a comment.
+    """Read twelve numbers a line, between blanks, tabs, commas or semicolons; # is a
+    comment.
 
     Raises:
         ExchangeError: names the line.
@@ -54,10 +55,10 @@ def read_vectors_text(text: str, file: str = "<text>") -> ConeVec:
 
 
 def read_vectors_array(array: npt.NDArray[np.generic], file: str = "<array>") -> ConeVec:
-    """ASTRA's cone_vec from an array (n, 12) of numbers.
+    """Read ASTRA's cone_vec from an array (n, 12) of numbers.
 
     Raises:
-        ExchangeError: another shape or kind.
+        ExchangeError: the shape or type is different.
     """
     if array.ndim != 2 or array.shape[1] != 12 or not _real(array):
         what = f"{file}: an array of {array.dtype}"
@@ -66,7 +67,9 @@ def read_vectors_array(array: npt.NDArray[np.generic], file: str = "<array>") ->
 
 
 def csv_text(geometry: ScanGeometry) -> str:
-    """One line a view: frame, file, stage angle [deg], then the twelve numbers [mm]."""
+    """Write one line a view: frame, file, stage angle [deg], then the twelve numbers
+    [mm].
+    """
     out = io.StringIO()
     write = csv.writer(out, lineterminator="\n")
     if geometry.shape is not None:
@@ -80,7 +83,9 @@ def csv_text(geometry: ScanGeometry) -> str:
 
 
 def read_csv(text: str, file: str = "<csv>") -> ScanGeometry:
-    """A table with a header that names the twelve numbers, in any order; others are passed over.
+    """Read a table whose header names the twelve numbers, in any order.
+
+    Other columns are ignored.
 
     Raises:
         ExchangeError: names the line and what is missing.
@@ -112,7 +117,7 @@ def read_csv(text: str, file: str = "<csv>") -> ScanGeometry:
 
 
 def tomosipo_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
-    """The arguments of `ts.cone_vec` by name, vectors in its order z, y, x.
+    """Convert a geometry to the arguments of `ts.cone_vec` by name, vectors as z, y, x.
 
     Raises:
         ExchangeError: the detector's shape is unknown.
@@ -129,7 +134,7 @@ def tomosipo_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]
 def read_tomosipo(
     arrays: Mapping[str, npt.NDArray[np.generic]], file: str = "<npz>"
 ) -> ScanGeometry:
-    """The arguments of `ts.cone_vec`, as `tomosipo_arrays` gives them.
+    """Convert the arguments of `ts.cone_vec`, as in `tomosipo_arrays`, to a geometry.
 
     Raises:
         ExchangeError: one is missing or has another shape.
@@ -152,10 +157,10 @@ def read_tomosipo(
 
 
 def cone_vec_of(numbers: npt.ArrayLike, file: str) -> ConeVec:
-    """The geometry of rows (n, 12) that came from a file.
+    """Convert rows (n, 12) that came from a file to a geometry.
 
     Raises:
-        ExchangeError: none at all, one that is not finite, or a panel of no size.
+        ExchangeError: there are no rows, a number is not finite, or a panel has no size.
     """
     rows = np.asarray(numbers, dtype=np.float64).reshape(-1, 12)
     if not len(rows):
@@ -172,7 +177,7 @@ def cone_vec_of(numbers: npt.ArrayLike, file: str) -> ConeVec:
 
 
 def _numbers(words: Sequence[str], file: str, line: int) -> list[float]:
-    """The twelve numbers of a row.
+    """Read the twelve numbers of a row.
 
     Raises:
         ExchangeError: names file and line.
@@ -211,7 +216,7 @@ class _Document(BaseModel):
 
 
 def geometry_text(geometry: ScanGeometry) -> str:
-    """As text: one line a view."""
+    """Write a geometry as JSON text, one line a view."""
     rows, cols = geometry.shape if geometry.shape is not None else (None, None)
     head = {
         "kind": KIND,
@@ -265,10 +270,10 @@ def read_geometry_text(text: str, file: str = "<geometry>") -> ScanGeometry:
 
 
 def read_json(text: str, file: str, kind: type[dict[str, Any]] = dict) -> dict[str, Any]:
-    """A JSON object; it and those inside it are of this kind.
+    """Read a JSON object; it and the objects inside it are of type `kind`.
 
     Raises:
-        ExchangeError: not one.
+        ExchangeError: the text is not a JSON object.
     """
     try:
         document = parse_json(text, kind)

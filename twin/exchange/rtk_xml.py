@@ -22,24 +22,24 @@ from flexdt.twin.plausibility import settled
 from flexdt.twin.plausibility.scan_geometry import distance_findings
 
 TO_RTK: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""Our (x, y, z) to RTK's; a turn, no mirror."""
+"""Matrix from our (x, y, z) to RTK's; a rotation, no mirror."""
 SAME: Final = 1e-9
-"""Relative difference of distances that rounding makes."""
+"""Largest relative difference of distances that counts as rounding."""
 VERSION: Final = "3"
 NAMES: Final = ("GantryAngle", "OutOfPlaneAngle", "InPlaneAngle", "SourceToIsocenterDistance",
                 "SourceToDetectorDistance", "SourceOffsetX", "SourceOffsetY", "ProjectionOffsetX",
                 "ProjectionOffsetY")  # fmt: skip
-"""Angles [deg], then lengths [mm]."""
+"""Names of the nine numbers: angles [deg], then lengths [mm]."""
 _PASSED_OVER = ("Matrix", "CollimationUInf", "CollimationUSup", "CollimationVInf",
                 "CollimationVSup")  # fmt: skip
 _ROOT = "RTKThreeDCircularGeometry"
 
 
 def rtk_text(geometry: ScanGeometry) -> str:
-    """The XML.
+    """Write the XML file.
 
     Raises:
-        ExchangeError: a view that nine numbers cannot hold.
+        ExchangeError: nine numbers cannot express a view.
     """
     require_panel(geometry.cone_vec, "RTK")
     lines = ['<?xml version="1.0"?>', "<!DOCTYPE RTKGEOMETRY>", f'<{_ROOT} version="{VERSION}">']
@@ -54,10 +54,10 @@ def rtk_text(geometry: ScanGeometry) -> str:
 
 
 def parameters_of(row: FloatArray, view: int = 0) -> tuple[float, ...]:
-    """The nine numbers (`NAMES`) of one cone_vec row.
+    """Compute the nine numbers (`NAMES`) of one cone_vec row.
 
     Raises:
-        ExchangeError: the source lies in the panel's plane.
+        ExchangeError: the source is in the panel's plane.
     """
     source, centre, u, v = (TO_RTK @ row[i : i + 3] for i in (0, 3, 6, 9))
     u, v = u / np.linalg.norm(u), v / np.linalg.norm(v)
@@ -79,7 +79,7 @@ def parameters_of(row: FloatArray, view: int = 0) -> tuple[float, ...]:
 
 
 def matrix_of(values: tuple[float, ...]) -> FloatArray:
-    """RTK's projection matrix (3, 4) of the nine numbers: its (x, y, z, 1) to the panel [mm]."""
+    """Compute RTK's projection matrix (3, 4): its (x, y, z, 1) to the panel [mm]."""
     gantry, out, turn = (math.radians(a) for a in values[:3])
     sid, sdd, sx, sy, px, py = values[3:]
     project = np.array(
@@ -157,7 +157,7 @@ def _require_distances(stated: list[tuple[float, float]], file: str) -> None:
 
 
 def row_of(values: tuple[float, ...], pitch_mm: tuple[float, float]) -> FloatArray:
-    """One cone_vec row of nine numbers and the pixel pitch."""
+    """Compute a cone_vec row from nine numbers and the pixel pitch."""
     gantry, out, turn = (math.radians(a) for a in values[:3])
     sid, sdd, sx, sy, px, py = values[3:]
     axes = TO_RTK.T @ rotation_y(gantry) @ rotation_x(out) @ rotation_z(turn)
@@ -166,6 +166,11 @@ def row_of(values: tuple[float, ...], pitch_mm: tuple[float, float]) -> FloatArr
 
 
 def _take(entry: ElementTree.Element, values: dict[str, float], file: str) -> None:
+    """Read the number of one XML element into `values`.
+
+    Raises:
+        ExchangeError: it is not finite, or an unknown element is not 0.
+    """
     if entry.tag in _PASSED_OVER:
         return
     try:

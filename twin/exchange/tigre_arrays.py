@@ -32,22 +32,24 @@ from flexdt.twin.exchange.view_arrays import (
 from flexdt.twin.geometry.conventions import FloatArray, rotation_z
 
 STILL: Final = 1e-11
-"""What an attribute may change by between views [mm, rad] and still be written once: a hundredth
-of what a format may lose."""
+"""Largest change of an attribute between views [mm, rad] that is written once: a
+hundredth of an exchange format's largest error."""
 UPRIGHT: Final = 1e-6
-"""Smallest part of the panel's normal that lies level, from which on its angle is determined."""
+"""Least horizontal part of the panel's normal from which its angle is computed."""
 PER_VIEW: Final = {"DSO": 0, "DSD": 0, "offOrigin": 3, "offDetector": 2, "rotDetector": 3}
-"""Attributes with a value a view -> numbers of one; 0: a number. Lengths [mm], turns [rad]."""
+"""Attributes with a value a view -> length of a value; 0: a number. Lengths [mm],
+turns [rad]."""
 PANEL: Final = ("nDetector", "dDetector", "sDetector")
-"""Counts and sizes; those along rows' direction (v) come first, as z does in offOrigin."""
+"""Counts and sizes; the direction of rows (v) comes first, as z does in offOrigin."""
 ANGLES: Final = "angles"
 
 
 def tigre_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
-    """The attributes by name, and `angles` [rad].
+    """Convert a geometry to TIGRE's attributes by name, and `angles` [rad].
 
     Raises:
-        ExchangeError: skew pixels, several pixel sizes, no shape; a panel that lies flat; an
+        ExchangeError: skew pixels, several pixel sizes, an unknown shape, a horizontal
+            panel, or an
             object's origin that is not between source and panel.
     """
     rows, columns = require_shape(geometry, "TIGRE")
@@ -82,7 +84,7 @@ def tigre_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
 
 
 def _once(values: FloatArray) -> FloatArray:
-    """A value a view, or the one of all views."""
+    """Return one value if all views have the same, else the value of each view."""
     still = np.ptp(values, axis=0).max() <= STILL
     one: FloatArray = values[:1] if values.ndim == 1 else values[0]
     return np.ascontiguousarray(one if still else values) + 0.0
@@ -107,10 +109,11 @@ def _turns(axes: FloatArray) -> FloatArray:
 
 
 def read_tigre(arrays: Arrays, file: str = "<npz>") -> ScanGeometry:
-    """The geometry of these attributes and angles.
+    """Convert TIGRE's attributes and angles to a geometry.
 
     Raises:
-        ExchangeError: one is missing, or does not hold; a centre of rotation (COR) besides.
+        ExchangeError: an attribute is missing or not valid, or there is a centre of
+            rotation (COR).
     """
     require_names(arrays, (*PER_VIEW, "nDetector", "dDetector", ANGLES), file)
     if "COR" in arrays and np.any(arrays["COR"]):
@@ -134,7 +137,7 @@ def read_tigre(arrays: Arrays, file: str = "<npz>") -> ScanGeometry:
 
 
 def _each(arrays: Arrays, name: str, size: int, file: str, views: int) -> FloatArray:
-    """The value of every view, of an array that holds one or all."""
+    """Return the value of each view from an array that holds one or all."""
     own: tuple[int, ...] = (size,) if size else ()
     single: tuple[int, ...] = (size,) if size else (1,)
     if np.shape(arrays[name]) == single:
@@ -143,7 +146,7 @@ def _each(arrays: Arrays, name: str, size: int, file: str, views: int) -> FloatA
 
 
 def _axes(turns: FloatArray) -> FloatArray:
-    """Rz Ry Rx (n, 3, 3) of turns about x, y and z (n, 3) [rad]."""
+    """Compute Rz Ry Rx (n, 3, 3) of turns about x, y and z (n, 3) [rad]."""
     yaw, pitch, roll = turns.T
     one, zero = np.ones_like(yaw), np.zeros_like(yaw)
     about_x = _stacked(one, zero, zero, zero, np.cos(yaw), -np.sin(yaw), zero, np.sin(yaw),
@@ -155,5 +158,5 @@ def _axes(turns: FloatArray) -> FloatArray:
 
 
 def _stacked(*entries: FloatArray) -> FloatArray:
-    """Matrices (n, 3, 3) of nine entries (n,), row by row."""
+    """Stack nine entries (n,) to matrices (n, 3, 3), row by row."""
     return np.stack(entries, axis=1).reshape(-1, SPACE, SPACE)

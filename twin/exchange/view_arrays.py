@@ -13,11 +13,11 @@ from flexdt.twin.geometry.conventions import FloatArray
 
 Arrays = Mapping[str, npt.NDArray[np.generic]]
 SPACE: Final = 3
-"""Numbers of a place or a direction."""
+"""Number of coordinates of a place or a direction."""
 
 
 def require_shape(geometry: ScanGeometry, format_name: str) -> tuple[int, int]:
-    """The detector's (rows, cols).
+    """Return the detector's (rows, cols).
 
     Raises:
         ExchangeError: they are unknown.
@@ -40,10 +40,10 @@ def require_names(arrays: Arrays, names: Sequence[str], file: str) -> None:
 
 
 def views_of(arrays: Arrays, name: str, file: str) -> int:
-    """Number of views of one array, (n, ...).
+    """Count the views of one array, (n, ...).
 
     Raises:
-        ExchangeError: it has none.
+        ExchangeError: there are none.
     """
     shape = np.shape(arrays[name])
     if not shape or not shape[0]:
@@ -52,20 +52,20 @@ def views_of(arrays: Arrays, name: str, file: str) -> int:
 
 
 def vectors_of(arrays: Arrays, names: Sequence[str], file: str) -> list[FloatArray]:
-    """Arrays (n, 3) of the same n.
+    """Read arrays (n, 3) of the same n.
 
     Raises:
-        ExchangeError: one has another shape, or holds no numbers.
+        ExchangeError: an array has another shape or is not numeric.
     """
     count = views_of(arrays, names[0], file)
     return [numbers_of(arrays, name, file, (count, SPACE)) for name in names]
 
 
 def numbers_of(arrays: Arrays, name: str, file: str, shape: tuple[int, ...]) -> FloatArray:
-    """One array of finite numbers.
+    """Read one array of finite numbers.
 
     Raises:
-        ExchangeError: it has another shape, or holds something else.
+        ExchangeError: it has another shape or other content.
     """
     array = np.asarray(arrays[name])
     if array.dtype.kind not in "iuf" or array.shape != shape:
@@ -77,10 +77,10 @@ def numbers_of(arrays: Arrays, name: str, file: str, shape: tuple[int, ...]) -> 
 
 
 def counts_of(arrays: Arrays, name: str, file: str, shape: tuple[int, ...]) -> tuple[int, ...]:
-    """One array of whole numbers above 0.
+    """Read one array of whole numbers above 0.
 
     Raises:
-        ExchangeError: it holds something else.
+        ExchangeError: it has other content.
     """
     found = numbers_of(arrays, name, file, shape).ravel()
     if (found < 1).any() or (found % 1 != 0).any():
@@ -89,10 +89,10 @@ def counts_of(arrays: Arrays, name: str, file: str, shape: tuple[int, ...]) -> t
 
 
 def sizes_of(arrays: Arrays, name: str, file: str, shape: tuple[int, ...]) -> FloatArray:
-    """One array of numbers above 0.
+    """Read one array of numbers above 0.
 
     Raises:
-        ExchangeError: it holds something else.
+        ExchangeError: it has other content.
     """
     found = numbers_of(arrays, name, file, shape)
     if (found <= 0.0).any():
@@ -101,10 +101,10 @@ def sizes_of(arrays: Arrays, name: str, file: str, shape: tuple[int, ...]) -> Fl
 
 
 def directions_of(arrays: Arrays, name: str, file: str, count: int) -> FloatArray:
-    """An array (count, 3) of unit vectors; others are normalised.
+    """Read an array (count, 3) of directions and normalise them.
 
     Raises:
-        ExchangeError: it holds something else, or a vector of no length.
+        ExchangeError: it has other content, or a vector of length zero.
     """
     found = numbers_of(arrays, name, file, (count, SPACE))
     lengths = np.linalg.norm(found, axis=1, keepdims=True)

@@ -23,13 +23,13 @@ from flexdt.twin.plausibility.scan_geometry import (
 from flexdt.twin.plausibility.volume_grid import grid_findings
 
 SOME_IMAGES = 9
-"""Images whose values are looked at."""
+"""Number of images whose values are examined."""
 SOME_PIXELS = 1 << 14
-"""Of each of them, about."""
+"""Approximate number of pixels examined in each of them."""
 
 
 class Operation(Enum):
-    """What is to be done with what is examined."""
+    """Operation that the examined data are meant for."""
 
     OPEN = "open"
     PROJECT = "project"
@@ -76,6 +76,7 @@ def _found(
     boxes: npt.ArrayLike | None,
     grid: FloatArray | None,
 ) -> Iterator[Finding]:
+    """Yield the findings of all checks that apply; arguments as for `examine`."""
     yield from geometry_findings(geometry, shape)
     if operation is not Operation.PROJECT:
         spans = tuple(span_findings(geometry))
@@ -97,7 +98,7 @@ def _found(
 
 
 def some_of(images: Any) -> npt.NDArray[Any]:
-    """A few pixels of a few images: every so many rows and columns, (k, r, c)."""
+    """Sample every so many rows and columns of a few images, (k, r, c)."""
     count, rows, cols = images.shape
     some = np.unique(np.linspace(0, count - 1, SOME_IMAGES).astype(int))
     each = max(1, int((rows * cols / SOME_PIXELS) ** 0.5))

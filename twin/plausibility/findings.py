@@ -12,14 +12,14 @@ from flexdt.twin.errors import TwinError
 
 
 class Severity(IntEnum):
-    """What a door does about a finding."""
+    """Reaction of an entry point to a finding."""
 
     NOTE = 0
-    """Nothing; it explains other findings."""
+    """No reaction; the finding explains others."""
     WARNING = 1
-    """It warns and goes on."""
+    """Warn and continue."""
     REFUSAL = 2
-    """It raises an error."""
+    """Raise an error."""
 
 
 KINDS: Final[Mapping[str, str]] = {
@@ -48,20 +48,12 @@ KINDS: Final[Mapping[str, str]] = {
     "other name": "a file named otherwise than the other images",
     "no data": "images in which nothing was recorded",
 }
-"""Kind of contradiction -> what it means."""
+"""Kind of contradiction -> its meaning."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What contradicts what.
-
-    Attributes:
-        kind: one of `KINDS`.
-        cause: what was found, with its figure and unit.
-        remedy: what the user can do.
-        severity: what a door does about it.
-        figure: the figure by which it was found, in the unit that `cause` says.
-    """
+    """A contradiction between two parts of the input."""
 
     kind: str
     cause: str
@@ -80,18 +72,18 @@ class Finding:
 
 
 class PlausibilityWarning(UserWarning):
-    """A warning of what `examine` found."""
+    """A warning about a finding of `examine`."""
 
 
 def warn_of(
     findings: Iterable[Finding], error: type[TwinError] = TwinError, *, stacklevel: int = 3
 ) -> None:
-    """Refuse as `settled` does, and warn of the rest.
+    """Raise an error for refusals as `settled` does, and warn about the other findings.
 
     Args:
-        findings: of one door.
-        error: that is raised.
-        stacklevel: of the door's caller, seen from the door.
+        findings: of one entry point.
+        error: type of error to raise.
+        stacklevel: of the entry point's caller, seen from the entry point.
     """
     for doubt in settled(findings, error):
         warnings.warn(doubt, PlausibilityWarning, stacklevel=stacklevel + 1)
@@ -100,12 +92,12 @@ def warn_of(
 def settled(
     findings: Iterable[Finding], error: type[TwinError] = TwinError, where: str = ""
 ) -> list[str]:
-    """Refuse, or give what is to be warned of.
+    """Raise an error for a refusal, or return the texts of warnings.
 
     Args:
-        findings: of one door.
-        error: that is raised.
-        where: goes before each sentence, such as a path.
+        findings: of one entry point.
+        error: type of error to raise.
+        where: prefix of each sentence, such as a path.
 
     Raises:
         TwinError: of the type `error`, for the first finding that is a refusal.

@@ -20,11 +20,12 @@ NUMBER: Final = re.compile(r"(?P<sign>[-+]?)(?P<whole>\d+)(?P<part>\.\d+)?")
 SIGNED_AFTER: Final = frozenset("_ =(,")
 """Characters, or the name's beginning, after which a hyphen is a minus sign."""
 MOST_OTHERS: Final = 0.1
-"""Share of names, or two of them, that may be written otherwise than the rest by mistake."""
+"""Largest share of names (or two names) that may differ in form from the rest by
+mistake."""
 EVEN: Final = 0.8
-"""Share of steps between numbers that are alike where a missing number is a gap."""
+"""Least share of equal steps between numbers for which a missing number is a gap."""
 TOLD: Final = 3
-"""Names that a message repeats."""
+"""Number of names in a message."""
 Key = tuple[str | float, ...]
 """Texts and numbers of a name in turn, beginning with a text."""
 
@@ -96,7 +97,7 @@ def other_name(others: Sequence[str], names: Sequence[str]) -> Finding:
 
 
 def duplicate(one: str, other: str) -> Finding:
-    """Refuse two files with one number."""
+    """Make the refusal of two files with one number."""
     cause = f"{one} and {other} have one number: which of them is meant is not known"
     return Finding("duplicate", cause, "allowed: one file a number", Severity.REFUSAL, 2.0)
 
@@ -106,7 +107,7 @@ def _is(names: Sequence[str]) -> str:
 
 
 def _keys(names: Sequence[str]) -> dict[str, Key]:
-    """What names are sorted by: their text with the numbers left out, and these."""
+    """Compute sort keys of names: their text without the numbers, and the numbers."""
     stems = {name: re.sub(r"\.[A-Za-z]\w*$", "", name) for name in names}
     plain = {name: _key(stem, signed=False, decimals=False) for name, stem in stems.items()}
     signs = {name: _key(stem, signed=True, decimals=False) for name, stem in stems.items()}
@@ -130,6 +131,7 @@ def _numbers(key: Key) -> tuple[float, ...]:
 
 
 def _key(stem: str, *, signed: bool, decimals: bool) -> Key:
+    """Split a file's stem into texts and numbers."""
     parts: list[str | float] = []
     at = 0
     for match in NUMBER.finditer(stem):
@@ -146,7 +148,7 @@ def _key(stem: str, *, signed: bool, decimals: bool) -> Key:
 
 
 def _decimal(decimal: dict[str, Key], whole: dict[str, Key], stems: dict[str, str]) -> bool:
-    """Whether points in names are decimal points and not between two numbers."""
+    """Return whether points in names are decimal points and not separators of numbers."""
     if len(set(decimal.values())) < len(set(whole.values())):
         return len(_texts(decimal)) < len(_texts(whole))
     parts = [m["part"][1:] for s in stems.values() for m in NUMBER.finditer(s) if m["part"]]

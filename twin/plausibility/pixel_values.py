@@ -11,21 +11,22 @@ import numpy.typing as npt
 from flexdt.twin.plausibility.findings import Finding, Severity
 
 EDGE_PART: Final = 0.06
-"""Of an image's columns, or rows, that lie at its edges."""
+"""Share of an image's columns, or rows, that count as its edges."""
 OPEN: Final = (0.95, 1.05)
-"""Transmission of the open beam."""
+"""Range of transmission of the open beam."""
 SAME_BEAM: Final = 0.05
-"""Share of pixels that the open beam must have."""
+"""Least share of pixels that show the open beam."""
 DARKER: Final = 0.85
-"""Transmission behind an object, relative to the open beam."""
+"""Largest transmission behind an object, relative to the open beam."""
 MOST_BRIGHT: Final = 0.02
-"""Share of pixels that noise makes brighter than the open beam by a fifth."""
+"""Largest share of pixels that noise makes a fifth brighter than the open beam."""
 COUNTED: Final = 25.0
-"""Line integrals above which no photon passes: of fewer than 1e-10 photons."""
+"""Line integral above which no photon passes: fewer than 1e-10."""
 MOST_PER_MM: Final = 200.0
-"""No element attenuates more at energies of tubes [1/mm]."""
+"""Largest attenuation of any element at energies of tubes [1/mm]."""
 LEAST_HOUNSFIELD: Final = -200.0
-"""A volume of attenuation goes below zero by artefacts alone, never so far."""
+"""Value below which a volume is in Hounsfield units: artefacts never bring attenuation
+so low."""
 
 
 def integral_findings(images: npt.NDArray[Any]) -> Iterator[Finding]:
@@ -69,7 +70,7 @@ _FROM_COUNTS: Final = "give counts with their flat image, as DataSet.from_arrays
 
 
 def _beam(images: npt.NDArray[Any]) -> float | None:
-    """The value at the images' left and right edges, where both are alike; None where not."""
+    """Return the value at the images' left and right edges if both are alike, else None."""
     wide = max(1, int(EDGE_PART * images.shape[2]))
     edges = images[:, :, :wide], images[:, :, -wide:]
     left, right = (float(np.median(edge)) for edge in edges)

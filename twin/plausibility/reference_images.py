@@ -12,19 +12,20 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.plausibility.findings import Finding, Severity
 
 MOST_APART: Final = 0.015
-"""Difference of flat images' levels that is no more than a tube's own unsteadiness."""
+"""Largest relative difference of flat images' levels by a tube's own variation."""
 MOST_DRIFT: Final = 0.03
-"""Difference of the open beam and the flat image that scatter or a tube's drift may have."""
+"""Largest relative difference of open beam and flat image by scatter or a tube's
+drift."""
 SIGMAS: Final = 6.0
-"""Differences below so many standard deviations are noise."""
+"""Differences below this many standard deviations count as noise."""
 STRIP_PART: Final = 0.03
-"""Of an image's columns that a strip at its edge takes."""
+"""Width of a strip at an image's edge, as a share of its columns."""
 LEVEL: Final = 0.004
-"""Difference of neighbouring strips in the open beam."""
+"""Largest relative difference of neighbouring strips in the open beam."""
 BLOCKS: Final = 4
 """Parts of a strip that are compared with each other."""
 SEEN: Final = 0.8
-"""Share of the views that must see the open beam on both sides."""
+"""Least share of the views that must see the open beam on both sides."""
 
 
 def flat_findings(flats: npt.NDArray[Any], dark: npt.NDArray[Any]) -> Iterator[Finding]:
@@ -75,7 +76,7 @@ def beam_findings(levels_seen: Sequence[float | None]) -> Iterator[Finding]:
 
 
 def _drifts(levels: FloatArray) -> bool:
-    """Whether levels rise or fall through the whole scan."""
+    """Return whether levels rise or fall throughout the scan."""
     line = np.polyval(np.polyfit(np.arange(len(levels)), levels, 1), np.arange(len(levels)))
     return float(np.abs(levels - line).max()) < 0.3 * float(np.ptp(levels))
 
@@ -83,7 +84,8 @@ def _drifts(levels: FloatArray) -> bool:
 def open_beam(
     counts: npt.NDArray[Any], dark: npt.NDArray[Any], opened: npt.NDArray[Any]
 ) -> float | None:
-    """The level of the open beam at an image's left and right edges, relative to the flat image.
+    """Compute the open beam's level at an image's left and right edges, relative to the
+    flat.
 
     Args:
         counts: the image (rows, cols).
@@ -116,6 +118,6 @@ def open_beam(
 
 
 def _blocks(strip: npt.NDArray[Any]) -> FloatArray:
-    """Means of the parts of a strip, from top to bottom."""
+    """Average the parts of a strip, from top to bottom."""
     parts = [part[np.isfinite(part)] for part in np.array_split(strip, BLOCKS)]
     return np.array([float(part.mean()) if part.size else np.nan for part in parts])

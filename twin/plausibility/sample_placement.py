@@ -15,11 +15,11 @@ from flexdt.twin.geometry.virtual_panel import stretches
 from flexdt.twin.plausibility.findings import Finding, Severity
 
 MOST_MAGNIFIED: Final = 1000.0
-"""No tube has a focal spot that is worth more."""
+"""Largest magnification for which a tube's focal spot is small enough."""
 MOST_OVERSIZE: Final = 100.0
-"""Size of a sample's shadow, relative to the panel, above which lengths are of two units."""
+"""Largest size of a sample's shadow relative to the panel; above, units are mixed up."""
 FEWEST_PIXELS: Final = 16
-"""Rows and columns of a panel that is one, and not a few rays through a sample."""
+"""Least rows and columns of a panel; fewer are single rays through a sample."""
 UNITS: Final = "are all lengths in mm?"
 
 

@@ -14,39 +14,42 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.plausibility.findings import Finding, Severity
 
 SOME_VIEWS: Final = 16
-"""Views whose panels are looked at."""
+"""Number of views whose panels are examined."""
 WIDEST_DEG: Final = 120.0
-"""Angle under which no source sees a whole panel."""
+"""Largest angle under which a source sees a panel [deg]."""
 MOST_PITCH: Final = 0.5
-"""Pitch of a pixel relative to the distance of source and panel that no panel has."""
+"""Largest pixel pitch relative to the distance of source and panel."""
 RADIANS_SPAN: Final = 4 * math.pi * 1.01
-"""Spans up to two turns of radians; as degrees they are a few degrees."""
+"""Largest span of angles given in radians, two turns; as degrees it is a few degrees
+[rad]."""
 RADIANS_VIEWS: Final = 8
-"""Views from which on so narrow a span is doubtful."""
+"""Number of views from which on so narrow a span is doubtful."""
 MOST_TURNS: Final = 20.0
-"""Turns of a circular scan above which its angles are degrees for radians."""
+"""Number of turns of a circular scan above which degrees were given as radians."""
 FEW_A_TURN: Final = 12.0
-"""Views a turn below which several turns of equal steps are degrees for radians."""
+"""Views a turn below which several turns of equal steps are degrees given as radians."""
 GOLDEN: Final = (math.pi * (3 - math.sqrt(5)), math.pi * (math.sqrt(5) - 1))
 """Steps of golden ratio between views, whose turns overlap by intention [rad]."""
 MISSING_DEG: Final = (12.0, 30.0)
-"""Gaps of directions from which an arc is limited, where views are even, and else."""
+"""Gaps of directions from which an arc is limited, for even views and for others
+[deg]."""
 TIMES_USUAL: Final = (8.0, 5.0)
-"""So many usual steps the same gaps must have."""
+"""Least size of the same gaps, in usual steps."""
 INCLINED_DEG: Final = (10.0, 20.0)
-"""Inclination of the beam to the plane of rotation that FDK is warned of, and refuses."""
+"""Inclinations of the beam to the plane of rotation at which FDK warns and refuses
+[deg]."""
 FDK_TOO: Final = "an iterative method (sirt, cgls, tv) takes any trajectory"
 
 
 def distance_findings(
     sod: float, sdd: float, pixel: npt.ArrayLike, names: tuple[str, str] = ("SOD", "SDD")
 ) -> Iterator[Finding]:
-    """Refuse distances and pixels that a file or dictionary states and no scanner has.
+    """Refuse distances and pixels that no scanner has.
 
     Args:
         sod, sdd: source to axis and to panel [mm].
         pixel: pitches [mm].
-        names: of the distances, as the file has them.
+        names: of the distances in the file or dictionary.
     """
     pitches = np.atleast_1d(np.asarray(pixel, dtype=np.float64))
     if not (math.isfinite(sod) and math.isfinite(sdd) and 0.0 < sod <= sdd):
@@ -115,7 +118,7 @@ def geometry_findings(cone_vec: ConeVec, shape: tuple[int, int] | None) -> Itera
 
 
 def _still_source(cone_vec: ConeVec, distance: FloatArray) -> bool:
-    """Whether all views have one source and beams all around it."""
+    """Return whether all views have one source, with beams all around it."""
     if len(cone_vec) < 3 or float(np.ptp(cone_vec.source, axis=0).max()) > 1e-9 * distance.max():
         return False
     beam = cone_vec.detector - cone_vec.source
@@ -151,14 +154,14 @@ def radian_findings(angles: npt.ArrayLike) -> Iterator[Finding]:
 
 
 def _round_degrees(span: float, step: float) -> bool:
-    """Whether a span, or with a step, is a number of degrees that scans have."""
+    """Return whether a span, alone or with a step, is a usual number of degrees."""
     return any(
         abs(whole / 5.0 - round(whole / 5.0)) < 2e-3 and whole > 0 for whole in (span, span + step)
     )
 
 
 def arc_deg(cone_vec: ConeVec) -> float:
-    """The angle that the views of a circular scan run through [deg]."""
+    """Compute the angle that the views of a circular scan cover [deg]."""
     azimuth = azimuths(cone_vec)
     at = np.sort(azimuth % math.tau)
     gaps = np.diff(at, append=at[0] + math.tau)
@@ -166,13 +169,13 @@ def arc_deg(cone_vec: ConeVec) -> float:
 
 
 def azimuths(cone_vec: ConeVec) -> FloatArray:
-    """Of each view's beam about z, (n,) [rad]."""
+    """Compute the direction of each view's beam about z, (n,) [rad]."""
     beam = cone_vec.detector - cone_vec.source
     return np.asarray(np.arctan2(beam[:, 1], beam[:, 0]))
 
 
 def about_z(cone_vec: ConeVec) -> bool:
-    """Whether the views turn about z at one inclination, as those of a circle or helix do."""
+    """Return whether the views turn about z at one inclination, as on a circle or helix."""
     beam = cone_vec.detector - cone_vec.source
     level = np.hypot(beam[:, 0], beam[:, 1])
     if not (level > 0.05 * np.linalg.norm(beam, axis=1)).all():

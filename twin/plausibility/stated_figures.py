@@ -16,11 +16,11 @@ from flexdt.twin.plausibility.findings import Finding, Severity
 from flexdt.twin.plausibility.scan_geometry import about_z, azimuths
 
 SAME_ANGLE_DEG: Final = 0.1
-"""Difference of angles that encoders have."""
+"""Largest difference of angles by encoders [deg]."""
 STEP_PART: Final = 0.2
-"""Or this part of the step between views, whichever is more."""
+"""The same as a share of the step between views; the larger of both counts."""
 SAME_PIXEL: Final = 0.02
-"""Relative difference of pixels, some of which are stated with two digits."""
+"""Largest relative difference of pixel sizes, some of which have two digits."""
 
 
 def angle_findings(geometry: ConeVec, stated_rad: npt.ArrayLike) -> Iterator[Finding]:
@@ -85,7 +85,9 @@ def _wrapped(angle: FloatArray) -> FloatArray:
 
 
 def _worst(own: FloatArray, stated: FloatArray) -> float:
-    """Largest difference of angles, of the better of both senses and the best zero [rad]."""
+    """Compute the largest difference of angles, for the best zero and sense of rotation
+    [rad].
+    """
     found = []
     for sense in (1.0, -1.0):
         off = own - sense * stated
@@ -95,7 +97,10 @@ def _worst(own: FloatArray, stated: FloatArray) -> float:
 
 
 def _same_set(own: FloatArray, stated: FloatArray, allowed: float) -> bool:
-    """Whether the angles are the same in another order, counted from the first or least of each."""
+    """Return whether the angles are equal in another order.
+
+    They are counted from the first or the least of each.
+    """
     for sense in (1.0, -1.0):
         turned = sense * stated
         zeros = {float(turned[0]), float(turned[-1]), float(turned.min())}

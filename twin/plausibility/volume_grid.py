@@ -13,17 +13,19 @@ from flexdt.twin.plausibility.findings import Finding, Severity
 
 SOME_VIEWS: Final = 60
 POINTS: Final = 7
-"""Points along each axis of a grid that are looked at."""
+"""Examined points along each axis of a grid."""
 MOST_UNSEEN: Final = 0.75
-"""Share of a grid's points that lie beside the field of view; of a square about a circle, .21."""
+"""Largest share of a grid's points outside the field of view; .21 for a square about a
+circle."""
 LEVEL: Final = 1e-3
-"""Rise of the source, relative to its distance from the panel, of a circle."""
+"""Largest rise of the source on a circle, relative to its distance from the panel."""
 BEHIND: Final = 0.25
-"""Share of the views that see a grid behind the panels of all."""
+"""Least share of the views that see a grid behind the panels of all."""
 SELDOM: Final = 0.25
-"""Share of views that see a point beside the field of view, relative to that of the middle."""
+"""Largest share of views that see a point outside the field of view, relative to the
+middle."""
 FEWEST_VOXELS: Final = 4
-"""Voxels across a field of view."""
+"""Least number of voxels across a field of view."""
 
 
 def grid_findings(
@@ -85,11 +87,11 @@ def grid_findings(
 
 
 def _crossed(at: FloatArray, ahead: FloatArray, shape: tuple[int, int]) -> bool:
-    """Whether the shadow of the grid's points, as a whole, may meet the panel in some view.
+    """Return whether the shadow of the grid's points may meet the panel in some view.
 
     Args:
-        at: their images, (n, k, 2) pixels.
-        ahead: which of them lie between source and panel, (n, k).
+        at: images of the points, (n, k, 2) [px].
+        ahead: whether each point is between source and panel, (n, k).
         shape: detector (rows, cols).
     """
     far = np.array(shape[::-1]) - 0.5
@@ -99,7 +101,7 @@ def _crossed(at: FloatArray, ahead: FloatArray, shape: tuple[int, int]) -> bool:
 
 
 def voxel_findings(voxel_mm: float, view_mm: float) -> Iterator[Finding]:
-    """Refuse voxels that a field of view of `view_mm` across holds too few of."""
+    """Refuse voxels so large that too few fit into a field of view of `view_mm`."""
     if voxel_mm * FEWEST_VOXELS > view_mm:
         cause = f"voxels of {voxel_mm:g} mm in a field of view of {view_mm:.4g} mm across"
         remedy = f"allowed: below {view_mm / FEWEST_VOXELS:.3g} mm; is the voxel in mm?"
