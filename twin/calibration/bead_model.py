@@ -1,8 +1,7 @@
-"""What calibration knows of a phantom: where its beads are, how large they are, and how precisely
-their positions are known.
+"""Beads of a phantom for calibration: positions, sizes, and the tolerance of the positions.
 
-`BeadPhantom` is the protocol that any phantom satisfies; `BeadModel` is the frozen value that
-calibration computes with. Meshes play no part here, materials by their contrast alone.
+`BeadPhantom` is the protocol that any phantom satisfies; `BeadModel` is the frozen value
+that calibration computes with. It has no meshes, and of materials only the contrast.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ class BeadPhantom(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class BeadModel:
-    """Beads as calibration sees them, read-only float64.
+    """The beads of a phantom, read-only float64.
 
     Attributes:
         beads: centres in the object's frame, (k, 3) [mm].
@@ -43,8 +42,8 @@ class BeadModel:
         tolerance_mm: standard deviation of each coordinate of each bead about `beads` [mm]; 0 if
             the phantom is exact.
         name: for reports.
-        contrast: (k,) line integral through each bead's middle above its surroundings; None: they
-            are of one material.
+        contrast: (k,) line integral through each bead's middle above its surroundings;
+            None: all are of one material.
     """
 
     beads: FloatArray
@@ -77,21 +76,21 @@ class BeadModel:
         return 2.0 * self.bead_radius_mm if self.contrast is None else self.contrast
 
     def mirrored(self) -> BeadModel:
-        """The mirror image (x to -x): what a wrongly handed model would look like."""
+        """Return the mirror image (x to -x), as of a model of the wrong handedness."""
         beads = self.beads * np.array([-1.0, 1.0, 1.0])
         return replace(self, beads=beads, name=f"{self.name}, mirrored")
 
     def turned_over(self) -> BeadModel:
-        """Turned by 180 deg about x: what stands on its head."""
+        """Turn the model by 180 deg about x: a phantom upside down."""
         beads = self.beads * np.array([1.0, -1.0, -1.0])
         return replace(self, beads=beads, name=f"{self.name}, upside down")
 
 
 def bead_model(phantom: BeadPhantom | BeadModel | npt.ArrayLike) -> BeadModel:
-    """The bead model of a phantom, or of bare bead centres (k, 3) (radius then 1 mm).
+    """Make the bead model of a phantom, or of bare bead centres (k, 3) (radius then 1 mm).
 
     Raises:
-        TwinError: there are no beads in it.
+        TwinError: it has no beads.
     """
     match phantom:
         case BeadModel():
@@ -137,7 +136,7 @@ def _centre(ball: Solid) -> FloatArray:
 
 
 def spot_radii(model: BeadModel, cone: ConeVec) -> FloatArray:
-    """Radius of each bead's spot, (n, k) [px], to first order (minor semi-axis).
+    """Compute the radius of each bead's spot, (n, k) [px], to first order (minor semi-axis).
 
     It is below 0 for a bead behind the source.
     """

@@ -14,13 +14,19 @@ from flexdt.twin.calibration.request import CalibrationRequest
 OTHER_BEADS = 1.0 / 6.0
 """Deviation of the first radii from which beads are others."""
 BLURRED_FIRST = 0.4
-"""The same if blur is to be measured yet: what is blurred is wider."""
+"""The same before blur is measured: blurred spots are wider."""
 
 
 def judge_first_sizes(
     state: Calibration, request: CalibrationRequest, fit: FitResult
 ) -> list[Finding]:
-    """Judge the sizes of the first measurement."""
+    """Judge the sizes of spots in the first measurement.
+
+    Args:
+        state: scans, identified, with their spots.
+        request: whether a second measurement follows, which allows more blur now.
+        fit: gives the geometry of each scan.
+    """
     out = []
     allowed = BLURRED_FIRST if request.second_look else OTHER_BEADS
     sized = zip(state.scans, state.identifications, state.looks, strict=True)
@@ -31,7 +37,7 @@ def judge_first_sizes(
 
 
 def judge_sizes(state: Calibration, fit: FitResult) -> list[Finding]:
-    """Judge the sizes of the second measurement; of the first where the second could not tell."""
+    """Judge the sizes of the second measurement, or of the first where the second has none."""
     out = []
     for g, scan in enumerate(state.scans):
         radii = spot_radii(state.model, scan.poses.cone_vec(fit.group_parameters[g]))

@@ -1,7 +1,7 @@
-"""Lag of the camera: a bead that is shown once more, faintly, where it stood one frame ago.
+"""Lag of the camera: a faint second image of a bead at its place in the frame before.
 
-Where it will stand in the next frame there is nothing yet: what both places show in common (the
-body, the panel) is no lag.
+The bead's place in the next frame is still empty: structures that both places have in
+common (the body, the panel) are no lag.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from flexdt.twin.calibration.frame_source import Frames
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 SURE = 5.0
-"""Sigmas from which lag is taken out. The beads must agree: what turns with the object, ahead of
-one bead or behind it, looks like lag of that bead alone."""
+"""Sigmas from which lag is removed. The beads must agree: structures that turn with the
+object, ahead of one bead or behind it, look like lag of that bead alone."""
 SEEN_AT_LEAST = 0.002
 """Lag below which it is left: a ghost so faint moves no shadow by a thousandth of its width."""
 LEAST_LIGHT = 0.005
@@ -49,7 +49,7 @@ class Lag:
 def lag_of(
     images: Float32Array, frames: Frames, plan: Windows, usable: npt.NDArray[np.bool_] | None = None
 ) -> Lag:
-    """Lag of a scan, from places that no bead of the frame itself is near.
+    """Estimate the lag of a scan, from places far from all beads of the frame itself.
 
     Args:
         images: (n, k, side, side) windows of the plan, line integrals.
@@ -79,8 +79,16 @@ def lag_of(
 
 
 def without_lag(frames: Frames, plan: Windows, lag: Lag) -> Float32Array:
-    """The windows of every frame, (n, k, side, side), less what is of the frame before; what that
-    one shows of its own predecessor is taken out first. Frames without one stay as they are."""
+    """Remove the lag of the frame before from the windows of every frame, (n, k, side, side).
+
+    The lag in the frame before is removed first. Frames without a frame before stay as
+    they are.
+
+    Args:
+        frames: of the scan, in the order in which they were taken.
+        plan: windows round the beads of each frame.
+        lag: of the camera.
+    """
     light = np.full((*plan.corner.shape[:2], plan.side, plan.side), np.nan)
     for back in (2, 1, 0):
         shown = np.exp(-np.roll(frames.windows(_rolled(plan, -back)), back, axis=0))
@@ -91,13 +99,13 @@ def without_lag(frames: Frames, plan: Windows, lag: Lag) -> Float32Array:
 
 
 def _rolled(plan: Windows, step: int) -> Windows:
-    """The plan with the places of the frame `step` before in each frame."""
+    """Return the plan with each frame's places replaced by those of the frame `step` before."""
     names = ("corner", "predicted", "radii", "stretch", "share", "crowded", "whole")
     return replace(plan, **{n: np.roll(getattr(plan, n), step, axis=0) for n in names})
 
 
 def _near(corner: npt.NDArray[np.int64], plan: Windows, some: slice) -> npt.NDArray[np.bool_]:
-    """Pixels of windows (n, k, side, side) near to which a bead of that frame stands."""
+    """Mark pixels of windows (n, k, side, side) that are near a bead of that frame."""
     reach = (1.12 * plan.radii * plan.stretch[..., 2] + 3.0)[some]
     out = np.zeros((*corner.shape[:2], plan.side, plan.side), dtype=bool)
     for bead in range(reach.shape[1]):
@@ -107,15 +115,18 @@ def _near(corner: npt.NDArray[np.int64], plan: Windows, some: slice) -> npt.NDAr
 
 
 def _products(light: Float32Array, shadow: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Of each bead the products, summed over its windows, of its shadow in another frame with what
-    the images show at its place there, and with itself, (k,) each."""
+    """Sum products over each bead's windows: of its shadow in another frame with the
+    image at that place, and with itself, (k,) each.
+    """
     use = np.isfinite(light) & np.isfinite(shadow)
     one, other = (_bent(values, use) for values in (shadow, light))
     return (one * other).sum(axis=(0, 2, 3)), (one * one).sum(axis=(0, 2, 3))
 
 
 def _bent(light: npt.NDArray[Any], use: npt.NDArray[np.bool_]) -> FloatArray:
-    """The windows less a paraboloid through what is used of each (the body); 0 elsewhere."""
+    """Subtract from windows a paraboloid through the usable pixels of each (the body); 0
+    elsewhere.
+    """
     x = np.linspace(-1.0, 1.0, light.shape[-1])
     right, down = np.broadcast_arrays(x[None, :], x[:, None])
     terms = np.stack([right**0, right, down, right**2, right * down, down**2])

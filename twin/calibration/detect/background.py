@@ -1,9 +1,10 @@
-"""What lies behind the beads besides their own phantom: curved backgrounds and foreign objects.
+"""Backgrounds of the beads apart from their phantom: curved ones and foreign objects.
 
-Subtracting a plane fitted to the ring around a spot removes a straight gradient. A curved one (a
-bad flat field, scatter) or an edge (something that is not in the model) shifts every centroid by
-less than the eye can see and by more than the reported uncertainty allows. Both show in the ring,
-averaged over blocks of pixels; pixels under the bead itself are not used.
+Subtracting a plane fitted to the ring around a spot removes a straight gradient. A curved
+one (a bad flat field, scatter) or an edge (an object missing from the model) shifts every
+centroid by less than the eye can see and by more than the reported uncertainty allows.
+Both show in the ring, averaged over blocks of pixels; pixels under the bead itself are
+not used.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from flexdt.twin.calibration.detect.windows import (
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 BLOCK: int = 5
-"""Pixels along a block's side; noise averages out over them, edges do not."""
+"""Side of a block [px]; noise averages out over blocks, edges do not."""
 SHADOW = 0.3
 """Line integral of a bead above which a block is left out."""
 BENT = 40.0
@@ -30,13 +31,14 @@ FAR_OUT = 7.0
 
 @dataclass(frozen=True, eq=False)
 class Background:
-    """What was found behind m windows.
+    """The backgrounds of m windows.
 
     Attributes:
-        misfit: (m,) mean square of what a smooth background leaves, by the median window's; 1 where
-            it cannot be judged.
+        misfit: (m,) mean square of the residuals of a smooth background, over the median
+            window's; 1 where it cannot be judged.
         disturbed: (m,) the misfit is further from the others' than noise makes it.
-        bend: (m, side, side) what to subtract besides a plane, or None where it is straight.
+        bend: (m, side, side) curvature to subtract after a plane, None if backgrounds are
+            straight.
         plane: (m, 3) line integral behind the middle of each window and its change by a pixel to
             the right and down.
     """
@@ -48,9 +50,11 @@ class Background:
 
 
 def survey(flat: Float32Array, alone: Float32Array) -> Background:
-    """Judge windows (m, side, side) of line integrals, given the beads alone rendered there.
+    """Judge the backgrounds of windows.
 
-    Pixels outside the image are nan.
+    Args:
+        flat: (m, side, side) line integrals, nan outside the image.
+        alone: (m, side, side) the beads alone, rendered there.
     """
     m, side = flat.shape[0], flat.shape[1]
     count = side // BLOCK
@@ -83,8 +87,9 @@ def survey(flat: Float32Array, alone: Float32Array) -> Background:
 def _bends(
     gain: FloatArray, curved: FloatArray, variance: FloatArray, valid: npt.NDArray[np.bool_]
 ) -> bool:
-    """Whether bent terms explain much in the median window, and most of what there is to explain:
-    edges are not explained by them."""
+    """Check whether bent terms explain much in the median window, and most of its
+    residuals: they do not explain edges.
+    """
     free = float(np.median(valid.sum(axis=1)))
     left = float(np.median(curved / np.maximum(variance, 1e-12))) - free
     explained = float(np.median(gain))
@@ -92,7 +97,7 @@ def _bends(
 
 
 def _blocks(windows: Float32Array, edge: int, count: int) -> FloatArray:
-    """Means of blocks, (m, count^2)."""
+    """Compute means of blocks, (m, count^2)."""
     inner = windows[:, edge : edge + count * BLOCK, edge : edge + count * BLOCK]
     part = inner.reshape(len(windows), count, BLOCK, count * BLOCK).sum(axis=2)
     summed = part.reshape(len(windows), count, count, BLOCK).sum(axis=3)
@@ -100,7 +105,9 @@ def _blocks(windows: Float32Array, edge: int, count: int) -> FloatArray:
 
 
 def _shapes(places: FloatArray, side: int) -> FloatArray:
-    """Polynomials up to the third degree on a grid of places, (places^2, 10), planes first."""
+    """Evaluate polynomials up to third degree on a grid of places, (places^2, 10), planes
+    first.
+    """
     t = (places - (side - 1) / 2) / (side / 2)
     y, x = (a.ravel() for a in np.meshgrid(t, t, indexing="ij"))
     one = np.ones_like(x)
@@ -110,7 +117,17 @@ def _shapes(places: FloatArray, side: int) -> FloatArray:
 def _fitted(
     off: FloatArray, valid: npt.NDArray[np.bool_], shapes: FloatArray, enough: npt.NDArray[np.bool_]
 ) -> tuple[FloatArray, FloatArray]:
-    """Sum of squares that polynomials leave in each window, (m,), and their coefficients."""
+    """Fit polynomials to each window.
+
+    Args:
+        off: (m, b) block means less the beads.
+        valid: (m, b) usable blocks.
+        shapes: (b, p) polynomials.
+        enough: (m,) windows with enough blocks.
+
+    Returns:
+        Sums of squares of the residuals (m,), and coefficients (m, p).
+    """
     p = shapes.shape[1]
     weight = valid.astype(np.float64)
     gram = (weight @ (shapes[:, :, None] * shapes[:, None, :]).reshape(len(shapes), -1)).reshape(

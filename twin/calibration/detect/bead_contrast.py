@@ -1,8 +1,9 @@
-"""How dark the beads' spots may be, and how dark each bead is as the first measurement has it.
+"""Contrast of the beads' spots: limits for the detection, and the values of the first
+measurement.
 
-Beads of a phantom may be of several sizes and materials. Their contrasts at the energy of the
-phantom's attenuations give no more than a rough ratio in a tube's beam, so they tell how faint a
-spot may be, and stand in where a bead was not seen.
+Beads of a phantom may be of several sizes and materials. Their contrasts at the energy of
+the phantom's attenuations give no more than a rough ratio in a tube's beam, so they bound
+how faint a spot may be, and replace the contrast of a bead that was not seen.
 """
 
 from __future__ import annotations
@@ -41,7 +42,8 @@ def detector_for(model: BeadModel, poses: Poses) -> SpotFinder:
 def seen_contrasts(
     model: BeadModel, detections: Sequence[Detections], index: npt.NDArray[np.int64]
 ) -> FloatArray:
-    """Typical contrast of each bead, (k,); of one that was not seen, as the others' ratio has it.
+    """Estimate the typical contrast of each bead, (k,); of an unseen one from the others'
+    ratio.
 
     Args:
         model: the beads, k.

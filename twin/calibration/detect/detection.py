@@ -1,11 +1,11 @@
-"""Detection of bead spots in a radiograph: their positions to a small fraction of a pixel, with
+"""Detection of bead spots in a radiograph: positions to a small fraction of a pixel, with
 covariances.
 
-The input is a line-integral image, -ln((counts - dark) / (flat - dark)). Candidates are found on a
-coarse image from which everything wider than a bead has been removed (gradients, bricks, large
-foreign objects). Each candidate is measured at full resolution, and what does not look like a ball
-is dropped. A bead that is cut by the image's edge is fitted as a ball with the other beads' radius.
-`identify` then finds out which bead each spot belongs to.
+The input is a line-integral image, -ln((counts - dark) / (flat - dark)). Candidates are
+found on a coarse image without structures wider than a bead (gradients, bricks, large
+foreign objects). Each candidate is measured at full resolution, and spots unlike a ball
+are dropped. A bead that is cut by the image's edge is fitted as a ball with the other
+beads' radius. `identify` then finds the bead of each spot.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 CAP = 6.0
-"""Line integrals above the background are cut here at the latest; noise may ask for less."""
+"""Largest line integral above the background; larger ones are cut. Noise may lower it."""
 FAINTEST = 0.12
 """Least height of a bead, as a share of the strongest small structure's in the image."""
 LIKENESS = 0.90
@@ -34,7 +34,7 @@ MISFIT = 0.3
 BLUR_PX = 0.7
 """Assumed blur (focal spot, scintillator) where a ball is fitted to part of a spot."""
 BRIGHT_PERCENT = 99.0
-"""Percentile of the pixels of an image of intensities that stands for the open beam."""
+"""Percentile of the pixels of an image of intensities that is taken for the open beam."""
 LEAST_LIGHT = 1e-4
 """Least intensity that is taken a logarithm of, as a share of the open beam."""
 _Candidate = tuple[float, float, float]
@@ -52,8 +52,9 @@ class Detections:
         radii_px: (k,) radius of each spot.
         contrast: (k,) line integral through its middle, above the background.
         bias: (k,) sphere-centre bias factor of the position (see `fit.problem.Centre`).
-        whole: (k,) whether all of the spot lies in the image.
-        likeness: (k,) correlation with a ball's profile (whole ones), or the share of it in view.
+        whole: (k,) whether the spot is entirely in the image.
+        likeness: (k,) correlation with a ball's profile (complete spots), or the share of
+            it in view.
         shape: (rows, cols) of the image.
     """
 
@@ -77,7 +78,7 @@ class Detections:
         radii_px: float | FloatArray,
         shape: tuple[int, int],
     ) -> Detections:
-        """Whole spots at points (k, 2) whose coordinates are known to `noise_px`."""
+        """Make complete spots at points (k, 2) whose coordinates are known to `noise_px`."""
         k = len(centers)
         one = np.ones(k)
         covariances = np.multiply.outer((noise_px * one) ** 2, np.eye(2))
@@ -86,7 +87,7 @@ class Detections:
 
 @dataclass(frozen=True)
 class SpotFinder:
-    """What to look for.
+    """Settings of the detection.
 
     Attributes:
         radius_px: smallest and largest radius of a bead's spot.
@@ -112,7 +113,7 @@ def detect_beads(
 
     Args:
         image: (rows, cols) line integrals.
-        detector: size of the spots to look for; None is the default.
+        detector: settings; None is the default.
         radius_px: (smallest, largest) radius of a spot, instead of the detector's.
 
     Returns:
@@ -148,13 +149,13 @@ def detect_beads(
 
 
 def of_intensity(image: Float32Array) -> Float32Array:
-    """Line integrals of an image of intensities, about those of its brightest pixels."""
+    """Convert an image of intensities to line integrals, relative to its brightest pixels."""
     bright = max(float(np.percentile(image, BRIGHT_PERCENT)), 1e-12)
     return np.asarray(-np.log(np.maximum(image / bright, LEAST_LIGHT)), dtype=np.float32)
 
 
 def coarser(image: Float32Array, factor: int) -> Float32Array:
-    """Means of factor x factor pixels; what is left over at the far edges is dropped."""
+    """Average factor x factor pixels; incomplete blocks at the far edges are dropped."""
     if factor == 1:
         return image
     rows, cols = image.shape[0] // factor, image.shape[1] // factor
@@ -167,7 +168,16 @@ def coarser(image: Float32Array, factor: int) -> Float32Array:
 def _candidates(
     coarse: Float32Array, factor: int, how: SpotFinder
 ) -> tuple[list[_Candidate], list[_Candidate]]:
-    """Compact bright blobs: those wholly inside, and those at the image's edge."""
+    """Find compact bright blobs: those entirely inside, and those at the image's edge.
+
+    Args:
+        coarse: (rows, cols) line integrals, averaged.
+        factor: of the averaging.
+        how: sizes and heights of spots.
+
+    Returns:
+        Candidates inside, and at the edge, in pixels of the original image.
+    """
     low, high = how.radius_px
     rows, cols = coarse.shape
     if rows < 3 or cols < 3:
@@ -214,13 +224,15 @@ def _candidates(
 
 
 def _middle(values: Float32Array) -> float:
-    """The median, near enough, without the care `np.median` takes."""
+    """Compute the median approximately, faster than `np.median`."""
     half = len(values) // 2
     return float(np.partition(values, half)[half])
 
 
 def _distinct(found: Sequence[_Found], by: int, reach: float) -> list[_Found]:
-    """One of several at a place, `reach` of a radius wide: that with most at its place `by`."""
+    """Keep one of several at a place, `reach` of a radius wide: the one with the largest
+    value `by`.
+    """
     out: list[_Found] = []
     for one in sorted(found, key=lambda r: -r[by]):
         if all(math.hypot(one[0] - o[0], one[1] - o[1]) > reach * o[2] for o in out):
@@ -231,13 +243,16 @@ def _distinct(found: Sequence[_Found], by: int, reach: float) -> list[_Found]:
 def _window(
     image: Float32Array, x: float, y: float, reach: float
 ) -> tuple[Float32Array, float, float]:
-    """Pixels within `reach` of a place, and the column and row of the first."""
+    """Cut out the pixels within `reach` of a place; also return the column and row of the
+    first.
+    """
     left, top = max(int(x - reach), 0), max(int(y - reach), 0)
     part = image[top : int(y + reach) + 2, left : int(x + reach) + 2]
     return np.ascontiguousarray(part), left, top
 
 
 def _measure(image: Float32Array, spot: _Candidate, how: SpotFinder) -> FloatArray | None:
+    """Measure a candidate at full resolution; None if it is unlike a ball or too faint."""
     x, y, radius = spot
     result = np.zeros(kernels.RESULTS)
     # What is measured may lie beside the spot or be larger; then a larger window is needed.
@@ -284,7 +299,7 @@ def _largest_group(
 
 
 def _kinds(found: list[FloatArray]) -> list[tuple[float, float]]:
-    """Typical radius and contrast of each group of spots that are alike."""
+    """Compute typical radius and contrast of each group of similar spots."""
     out = []
     while found:
         group, found = _largest_group(found, SpotFinder.same)
@@ -296,10 +311,9 @@ def _kinds(found: list[FloatArray]) -> list[tuple[float, float]]:
 def _cut_beads(
     image: Float32Array, spots: list[_Candidate], found: list[FloatArray]
 ) -> list[FloatArray]:
-    """Balls fitted to spots at the edge, with radius and contrast of the kind of whole ones that
-    leaves least.
+    """Fit balls to spots at the edge, with radius and contrast of the kind that fits best.
 
-    Without any whole bead in the image there is nothing to compare with, and they are left out.
+    They are left out where the image has no complete bead to compare with.
     """
     kinds = _kinds(found) if spots else []
     out: list[FloatArray] = []
@@ -313,7 +327,17 @@ def _cut_beads(
 def _fitted_cut(
     image: Float32Array, x: float, y: float, radius: float, peak: float
 ) -> FloatArray | None:
-    """A ball of a radius and contrast fitted to a spot at the edge; None if it is none."""
+    """Fit a ball of a given radius and contrast to a spot at the edge.
+
+    Args:
+        image: (rows, cols) line integrals.
+        x, y: of the spot [px].
+        radius: of the ball [px].
+        peak: its contrast.
+
+    Returns:
+        Results of the kernel; None if the misfit is too large.
+    """
     result = np.zeros(kernels.RESULTS)
     window, left, top = _window(image, x, y, 2.8 * radius + 8.0)
     kernels.fit_ball(
@@ -334,6 +358,7 @@ def _fitted_cut(
 
 
 def _pack(whole: list[FloatArray], cut: list[FloatArray], shape: tuple[int, int]) -> Detections:
+    """Sort results, complete spots first and strong ones first, into `Detections`."""
     rows = np.array([*whole, *cut]).reshape(-1, kernels.RESULTS)
     flags = np.array([True] * len(whole) + [False] * len(cut), dtype=bool)
     order = np.lexsort((-rows[:, kernels.PEAK], ~flags))
@@ -351,6 +376,6 @@ def _pack(whole: list[FloatArray], cut: list[FloatArray], shape: tuple[int, int]
 
 
 def covariances_of(results: FloatArray) -> FloatArray:
-    """Covariances (..., 2, 2) [px^2] in results (..., RESULTS) of the kernels."""
+    """Return the covariances (..., 2, 2) [px^2] in results (..., RESULTS) of the kernels."""
     places = [kernels.VAR_X, kernels.COV_XY, kernels.COV_XY, kernels.VAR_Y]
     return results[..., places].reshape(*results.shape[:-1], 2, 2)

@@ -1,9 +1,9 @@
-"""How the contrast of beads falls with what lies behind them, and how that is undone.
+"""Fading of the beads' contrast with the thickness behind them, and its removal.
 
-Scattered light and a beam of several energies make a bead fainter where more lies behind it, so the
-side of a spot behind which there is less counts for more, and all centroids are off in the
-direction in which the body becomes thinner. `fading` reads from the beads themselves how their
-contrast falls, and `evened` undoes it.
+Scattered light and a beam of several energies make a bead fainter where more material is
+behind it, so the side of a spot with less behind it counts for more, and all centroids
+are off in the direction in which the body becomes thinner. `fading` estimates from the
+beads themselves how their contrast falls, and `evened` undoes it.
 """
 
 from __future__ import annotations
@@ -16,21 +16,22 @@ import numpy.typing as npt
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 OUTLIER = 4.5
-"""Contrasts that are off by so many times what half of them are (three standard deviations) are not
-those of that bead."""
+"""Contrasts off by so many times the median deviation (three standard deviations) are
+outliers."""
 MEANS = 10
-"""Rounds in which the means of frames and beads are taken off in turns; few are missing."""
+"""Rounds in which the means of frames and beads are subtracted in turns; few are missing."""
 
 
 def fading(contrast: FloatArray, behind: FloatArray, seen: npt.NDArray[np.bool_]) -> float:
-    """How contrast changes with the line integral behind a bead, as a share of it.
+    """Estimate how contrast changes with the line integral behind a bead, as a share of it.
 
-    Each bead is compared with itself in other frames, and each frame's mean is taken off, so beads
-    of several sizes and a beam that drifts say nothing. What noise may have made of it is taken off
-    (James and Stein), so that of no slope nothing is left. Contrast C falls by at most as much as
-    what lies behind grows, if a ball lets nothing but scattered light through; where scattered
-    light is not even it grows with the line integral, by exp(C) - 1 times as much. What is beyond
-    these is an error of the level, which is in the contrast as well.
+    Each bead is compared with itself in other frames, and each frame's mean is
+    subtracted, so beads of several sizes and a beam that drifts have no effect. The
+    estimate is shrunk by its noise (James and Stein), so that no slope gives 0. Contrast
+    C falls by at most as much as the thickness behind grows, if a ball passes nothing but
+    scattered light; where scattered light is uneven it grows with the line integral, by
+    exp(C) - 1 times as much. Values beyond these are an error of the level, which is in
+    the contrast too.
 
     Args:
         contrast: of each bead in each frame, (n, k).
@@ -55,7 +56,7 @@ def fading(contrast: FloatArray, behind: FloatArray, seen: npt.NDArray[np.bool_]
 
 
 def _against_own_means(values: FloatArray, seen: npt.NDArray[np.bool_]) -> FloatArray:
-    """Values (n, k) less what their frame and their bead have in common, 0 where not seen."""
+    """Subtract from values (n, k) the means of their frame and bead; 0 where not seen."""
     out = np.where(seen, values, 0.0)
     for _ in range(MEANS):
         for axis in (0, 1):
@@ -67,14 +68,14 @@ def _against_own_means(values: FloatArray, seen: npt.NDArray[np.bool_]) -> Float
 def evened(
     flat: Float32Array, plane: FloatArray, body: Float32Array | None, slope: float
 ) -> Float32Array:
-    """Windows (m, side, side) with each bead as it would be were there as much behind all of it as
-    there is behind its middle.
+    """Return windows (m, side, side) in which each bead has a uniform background: that of
+    its middle.
 
     Args:
         flat: line integrals without the phantom's body.
-        plane: as `Background` has it.
+        plane: of `Background`.
         body: line integrals of the body, or None.
-        slope: of the contrast, as `fading` has it.
+        slope: of the contrast, from `fading`.
     """
     at = (np.arange(flat.shape[1]) - (flat.shape[1] - 1) / 2).astype(np.float32)
     value, right, down = plane.astype(np.float32).T[:, :, None, None]

@@ -20,14 +20,14 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """Windows as the kernels want them, (m = n k, ...): what is expected where.
+    """Windows and expected spots for the kernels, (m = n k, ...).
 
     Attributes:
         flat: (m, side, side) line integrals minus the body.
         offsets: (m, 2) expected place in the window.
         radii, stretch, peaks: (m,), (m, 3), (m,) expected spots.
-        windows: where they were cut.
-        entire: indices of whole, lone spots.
+        windows: their places in the images.
+        entire: indices of complete, lone spots.
     """
 
     flat: Float32Array
@@ -42,7 +42,13 @@ class Patches:
 def centroids(
     patches: Patches, index: npt.NDArray[np.intp], least: FloatArray | None = None
 ) -> FloatArray:
-    """`measure` in some windows; zeros elsewhere. least: (m,) noise to weigh pixels for."""
+    """Measure centroids in some windows by the kernel `measure`; zeros elsewhere.
+
+    Args:
+        patches: the windows.
+        index: of those to measure.
+        least: (m,) noise by which pixels are weighted.
+    """
     results = np.zeros((len(patches.flat), kernels.RESULTS))
     least = np.zeros(len(results)) if least is None else least
     for i in index:
@@ -58,8 +64,15 @@ def fits(
     free_radius: bool,
     masks: npt.NDArray[np.uint8],
 ) -> FloatArray:
-    """`fit_ball` in some windows; zeros elsewhere. blur: with the veil; masks: usable pixels of
-    those windows."""
+    """Fit balls in some windows by the kernel `fit_ball`; zeros elsewhere.
+
+    Args:
+        patches: the windows.
+        index: of those to fit.
+        blur: of the image [px], and the veil.
+        free_radius: estimate the radius too.
+        masks: usable pixels of those windows.
+    """
     results = np.zeros((len(patches.flat), kernels.RESULTS))
     whole = patches.windows.whole.ravel()
     for i, mask in zip(index, masks, strict=True):
@@ -71,7 +84,7 @@ def fits(
 
 
 def ring_noise(results: FloatArray, entire: npt.NDArray[np.intp]) -> float:
-    """Typical noise of the line integrals round whole spots; 0 without any."""
+    """Return the typical noise of line integrals around complete spots; 0 without any."""
     good = results[entire, kernels.OK] > 0
     return float(np.median(results[entire[good], kernels.NOISE])) if good.any() else 0.0
 
@@ -82,10 +95,10 @@ def take(
     fitted: npt.NDArray[np.intp],
     whole: npt.NDArray[np.bool_],
 ) -> npt.NDArray[np.intp]:
-    """Put fits into `results`: all of the partial spots', the good ones of the whole.
+    """Put fits into `results`: all of the partial spots', the good ones of complete spots.
 
     Returns:
-        Those that were put, in the order of `fitted`.
+        Indices of the used fits, in the order of `fitted`.
     """
     good = (fits[fitted, kernels.OK] > 0) & (fits[fitted, kernels.NOISE] < MISFIT)
     part = fitted[~whole[fitted]]
@@ -100,8 +113,9 @@ def take(
 
 
 def contrasts(results: FloatArray, patches: Patches) -> FloatArray:
-    """Contrast of each bead, (m,): the median over its whole spots, else as expected, scaled as
-    the others' are."""
+    """Estimate the contrast of each bead, (m,): the median over its complete spots, else
+    the expected one, scaled like the others.
+    """
     shape = patches.windows.whole.shape
     seen = np.where(results[:, kernels.OK] > 0, results[:, kernels.PEAK], np.nan).reshape(shape)
     given = patches.peaks.reshape(shape)[0]
@@ -117,7 +131,7 @@ def contrasts(results: FloatArray, patches: Patches) -> FloatArray:
 
 
 def usable(patches: Patches, index: npt.NDArray[np.intp]) -> npt.NDArray[np.uint8]:
-    """Usable pixels of some windows: inside the image and free of other beads' spots."""
+    """Mark usable pixels of some windows: inside the image and free of other beads' spots."""
     masks = np.isfinite(patches.flat[index]).astype(np.uint8)
     windows = patches.windows
     k = windows.corner.shape[1]

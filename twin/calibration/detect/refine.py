@@ -55,8 +55,8 @@ MISS_PX = 4.0
 SHARE = 0.35
 """Least share of a spot in view that is still fitted."""
 FIT_NOISE = 0.008
-"""Noise of the line integrals above which whole spots are fitted too: a fit weighs photons as
-they count, and halves the error of a centroid there (measured)."""
+"""Noise of the line integrals above which complete spots are fitted too: a fit weighs
+photons as they count, and halves the error of a centroid there (measured)."""
 FIT_BLUR_PX = 0.4
 """Least blur for that: an unblurred ball sampled at pixel centres misleads a fit by 0.015 px."""
 FEW_WINDOWS = 600
@@ -66,11 +66,11 @@ FADING_FRAMES = 60
 LARGEST_PX = 0.6
 """A larger systematic error of a rendered spot is not believed."""
 NEAR_PX = 0.15
-"""Spots further from their prediction are not judged by what is beside them."""
+"""Largest distance of a spot from its prediction for a judgement of its background [px]."""
 FOREIGN = 10.0
-"""Misfit of a background, by the others', from which a spot is left out."""
+"""Misfit of a background, relative to the others', from which a spot is left out."""
 LOST = 0.3
-"""Largest share of the spots that is left out because of what lies beside them."""
+"""Largest share of the spots left out because of their background."""
 EDGE = 0.04
 """Height of a body's edge (line integral) at a bead's rim from which its centroid is preferred."""
 SAMPLING_PX = 0.0005
@@ -82,17 +82,18 @@ SHARP_SAMPLING_PX = 0.0001
 
 @dataclass(frozen=True, eq=False)
 class Refined:
-    """Bead positions of n frames, (n, k, ...), nan where there is none.
+    """Bead positions of n frames, (n, k, ...), nan where a bead was not measured.
 
     Attributes:
         tracks: (n, k, 2) pixels.
         covariances: (n, k, 2, 2).
         bias: (n, k) sphere-centre bias factors.
         contrast: (n, k) line integral through the middle.
-        size: apparent over expected radius of whole spots, blur allowed for; nan if unknown.
-        blur_px: blur of the images, as the spots show it or assumed.
+        size: apparent over expected radius of complete spots, corrected for blur; nan if
+            unknown.
+        blur_px: blur of the images, estimated from the spots or assumed.
         sampling_px: what remains of the error that depends on a spot's place in the pixel grid.
-        body: the phantom's, as the images have it.
+        body: the phantom's, as seen in the images.
     """
 
     tracks: FloatArray
@@ -119,11 +120,11 @@ def measure_beads(
 
     Args:
         images: (n, k, side, side) line integrals from `crop`.
-        windows: where they were cut out.
+        windows: their places.
         cone: geometry the windows were planned with.
         model: the beads.
         contrast: line integral through the middle of a bead, one or (k,), as detected.
-        scene: the phantom's solids; what is not a bead is subtracted. None: only planes are.
+        scene: the phantom's solids; all but beads are subtracted. None: only planes are.
         draft: leave out the correction by rendered beads, which takes most of the time and needs a
             geometry that is right to a few hundredths of a pixel.
     """
@@ -179,11 +180,16 @@ def measure_beads(
 def _measured(
     patches: Patches, alone: Float32Array | None, body: Float32Array | None, sharp: Sharp
 ) -> Refined:
-    """Centroids and fits, less what the same measurement of the same beads rendered without noise
-    (`alone`; None leaves them as they are) shows to be their systematic error.
+    """Measure centroids and fits, corrected by the same measurement of rendered beads.
 
-    The rendered spots contain what pixels and blur do to a ball, its neighbours, and the
-    displacement of a ball's spot from the projection of its centre.
+    The rendered spots contain the effects of pixels and blur on a ball, its neighbours,
+    and the displacement of a ball's spot from the projection of its centre.
+
+    Args:
+        patches: the windows.
+        alone: beads rendered alone without noise, (m, side, side); None: no correction.
+        body: line integrals of the body, or None.
+        sharp: blur and apparent size.
     """
     windows = patches.windows
     n, k = windows.corner.shape[:2]
@@ -228,7 +234,14 @@ def _measured(
 
 
 def _evened(patches: Patches, behind: Background, body: Float32Array | None) -> Patches:
-    """The windows with beads whose contrast is the same all over, as some frames show it."""
+    """Return the windows with uniform contrast of each bead, by the fading found in some
+    frames.
+
+    Args:
+        patches: the windows.
+        behind: backgrounds.
+        body: line integrals of the body, or None.
+    """
     frames, beads = patches.windows.whole.shape
     few = patches.entire[patches.entire // beads % max(1, frames // FADING_FRAMES) == 0]
     found = centroids(patches, few)
@@ -246,9 +259,16 @@ def _evened(patches: Patches, behind: Background, body: Float32Array | None) -> 
 
 
 def _discount(results: FloatArray, behind: Background, expected: FloatArray) -> None:
-    """Trust spots less that have something foreign beside them, and leave out the worst, unless
-    there are too many. Those that are not where they are expected are not judged: that is a matter
-    of the fit, and their own rim looks foreign."""
+    """Raise the variance of spots with a foreign background, and drop the worst, unless
+    too many.
+
+    Spots far from their expected place are not judged: their own rim looks foreign.
+
+    Args:
+        results: (m, RESULTS), changed in place.
+        behind: backgrounds.
+        expected: (m, 2) places in the windows.
+    """
     there = results[:, kernels.OK] > 0
     off = results[:, [kernels.X, kernels.Y]] - expected
     there &= np.hypot(off[:, 0], off[:, 1]) < NEAR_PX
@@ -261,7 +281,14 @@ def _discount(results: FloatArray, behind: Background, expected: FloatArray) -> 
 
 
 def _accept(results: FloatArray, windows: Windows, contrast: FloatArray, sharp: Sharp) -> Refined:
-    """What passes the checks of place, size, contrast and likeness."""
+    """Keep the results that pass the checks of place, size, contrast and likeness.
+
+    Args:
+        results: (n, k, RESULTS).
+        windows: their places and expected spots.
+        contrast: (n, k) expected.
+        sharp: blur and apparent size.
+    """
     whole = windows.whole
     place = results[..., [kernels.X, kernels.Y]] + windows.corner
     off = np.linalg.norm(place - windows.predicted, axis=2)

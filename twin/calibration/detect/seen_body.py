@@ -1,9 +1,9 @@
-"""The phantom's own body as the images have it: its attenuation, and where it stands.
+"""The phantom's own body in the images: its attenuation and its place.
 
-The body is printed or glued together, and its description says neither its attenuation in this beam
-nor to a hundredth of a millimetre where it stands round the beads: `see_body` estimates both from
-the surroundings of some beads, by least squares with rendered bodies, before the body is
-subtracted.
+The body is printed or glued together, and its description states neither its attenuation
+in this beam nor, to a hundredth of a millimetre, its place relative to the beads:
+`see_body` estimates both from the surroundings of some beads, by least squares with
+rendered bodies, before the body is subtracted.
 """
 
 from __future__ import annotations
@@ -32,29 +32,30 @@ LEAST_BODY = 0.3
 """Attenuation of a seen body over the described one below which the body is not this one: one that
 is absent, turned or elsewhere has 0.01 to 0.03, one of half the attenuation 0.5."""
 PRIOR_MM = 0.5
-"""How far a body may stand from its description; holds a direction that no edge shows."""
+"""Standard deviation of a body's place about its description [mm]; fixes directions
+without an edge."""
 FAR_MM = 2.0
 """A body found further away than that is another body."""
 ROUNDS = 4
 STILL_MM = 0.01
-"""A step of the shift after which no further one is taken; what it leaves is of second order."""
+"""Step of the shift after which the search stops [mm]; the remainder is of second order."""
 
 
 @dataclass(frozen=True)
 class SeenBody:
-    """A body as the images have it.
+    """A body as seen in the images.
 
     Attributes:
-        factor: attenuation over the described one; 0 where the images do not show the body, nan
-            where none is described.
-        shift_mm: where it stands from where it is described, in the phantom's frame.
+        factor: attenuation over the described one; 0 where the images do not show the
+            body, nan without a description.
+        shift_mm: of its place from the described one, in the phantom's frame.
     """
 
     factor: float
     shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def scene(self, described: Scene) -> Scene:
-        """The body's solids as they are seen."""
+        """Return the body's solids with the estimated place and attenuation."""
         return Scene(
             tuple(
                 Solid(_shifted(s.shape, self.shift_mm), s.material, self.factor * s.mu_per_mm)
@@ -64,7 +65,7 @@ class SeenBody:
 
 
 NO_BODY = SeenBody(math.nan)
-"""None is described."""
+"""Value for a phantom without a described body."""
 
 
 def see_body(
@@ -75,21 +76,22 @@ def see_body(
     windows: Windows,
     blur: float = 0.0,
 ) -> SeenBody:
-    """Find the body in the rings round the beads.
+    """Estimate the body in the rings round the beads.
 
-    A body that is moved a little moves in each window as its bead would: the slope of the rendered
-    body along rows and columns, times that shift of the bead, is what the images have more.
+    A body that is moved a little moves in each window as its bead would: the image
+    changes by the slope of the rendered body along rows and columns, times that shift of
+    the bead.
 
     Args:
         images: (n, k, side, side) line integrals.
         described: the body's solids.
         cone: geometry of the n frames.
         model: the k beads.
-        windows: where the images were cut out.
+        windows: places of the images.
         blur: of the images [px].
 
     Returns:
-        The body; the described one if no ring has anything of it.
+        The body; the described one if no ring shows any of it.
     """
     frames, beads = np.nonzero(~windows.crowded)
     some = np.linspace(0, len(frames) - 1, min(BODY_SAMPLE, len(frames))).astype(np.intp)
@@ -141,7 +143,9 @@ def see_body(
 def _shift_of_beads(
     cone: ConeVec, model: BeadModel, beads: npt.NDArray[np.intp], shape: tuple[int, int]
 ) -> FloatArray:
-    """How the spot of a bead moves with the bead: (m, 2, 3) pixels (column, row) a millimetre."""
+    """Compute how the spot of a bead moves with the bead: (m, 2, 3) pixels (column, row)
+    a millimetre.
+    """
     one = np.arange(len(beads))
     there = cone.project_points(model.beads, shape)[one, beads]
     moved = [cone.project_points(model.beads + e, shape)[one, beads] for e in np.eye(3)]
@@ -149,21 +153,21 @@ def _shift_of_beads(
 
 
 def _rings(windows: Windows) -> npt.NDArray[np.bool_]:
-    """Pixels round the beads that no bead touches, (m, side, side)."""
+    """Mark pixels around the beads that no bead touches, (m, side, side)."""
     d2 = distances2(windows.corner, windows.side, windows.predicted)[:, 0]
     radii = windows.radii[:, 0, None, None]
     return np.asarray((d2 > (1.15 * radii + 2.0) ** 2) & (d2 < (1.6 * radii + 4.0) ** 2))
 
 
 def _levelled(values: npt.NDArray[Any], ring: npt.NDArray[np.bool_]) -> FloatArray:
-    """The values in each ring less their mean, 0 elsewhere, (m, side * side)."""
+    """Subtract the mean from the values in each ring; 0 elsewhere, (m, side * side)."""
     inside = np.where(ring, values, 0.0).astype(np.float64)
     mean = inside.sum(axis=(1, 2)) / np.maximum(ring.sum(axis=(1, 2)), 1)
     return np.asarray(np.where(ring, inside - mean[:, None, None], 0.0).reshape(len(ring), -1))
 
 
 def _weighted_median(values: FloatArray, weights: FloatArray) -> float:
-    """Weighted median."""
+    """Return the weighted median."""
     order = np.argsort(values)
     heap = np.cumsum(weights[order])
     return float(values[order][int(np.searchsorted(heap, 0.5 * heap[-1]))])

@@ -29,25 +29,25 @@ from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 # from rendered beads. Without whole spots the assumed values are returned, marked as not seen.
 
 SAMPLE = 24
-"""Spots from which blur and size are estimated, about."""
+"""Number of spots from which blur and size are estimated."""
 BLURS = (0.12, 0.25, 0.45, 0.7, 1.1, 1.7, 2.5, 3.6)
-"""Blurs that are tried [px]."""
+"""Trial blurs [px]."""
 VEILS = (0.0, 0.1, 0.2, 0.3, 0.45, 0.6)
-"""Veils that are tried."""
+"""Trial veils, as a share of the light."""
 CHECK_FINE = 3
 """Rays along a pixel's side where that estimate is checked on rendered beads."""
 SMALL_STEP = 0.05
-"""Relative change of blur and contrast by a correction, up to which what it leaves is of second
-order."""
+"""Relative change of blur and contrast below which corrections stop; the remainder is of
+second order."""
 MOST_ROUNDS = 6
 BODY_BLUR_PX = 0.18
 """Blur of the images below which the rendered body is subtracted as it is."""
 _Tried = tuple[FloatArray, FloatArray, FloatArray]
-"""Blurs that were tried with one veil, the misfits of the fits and the sizes they found."""
+"""Trial blurs with one veil, the misfits of their fits and the fitted sizes."""
 
 
 def balls_of(model: BeadModel, contrast: FloatArray, size: float = 1.0) -> Scene:
-    """The beads alone, as balls with the contrast (k,) and the size they are seen with."""
+    """Make balls of the beads alone, with the contrast (k,) and the size of their spots."""
     return Scene(
         tuple(
             Solid(Sphere((x, y, z), r * size), "bead", max(peak, 1e-3) / (2.0 * r * size))
@@ -59,7 +59,7 @@ def balls_of(model: BeadModel, contrast: FloatArray, size: float = 1.0) -> Scene
 
 
 def rest_of_blur(blur: float, fine: int) -> float:
-    """Blur left to apply when fine x fine rays of a pixel have been averaged already."""
+    """Return the blur left to apply after averaging fine x fine rays of a pixel."""
     return math.sqrt(max(blur**2 - (1.0 - 1.0 / fine**4) / 12.0, 0.01))
 
 
@@ -68,12 +68,12 @@ class Sharp:
     """Blur of the images [px] and size of the beads.
 
     Attributes:
-        blur, scale: blur and factor from expected to apparent radius with which a fit leaves least.
-        veil: part of the light about a bead that it does not take away, with which it leaves least.
-        seen: they were seen, not assumed.
+        blur, scale: blur, and factor from expected to apparent radius, of the best fit.
+        veil: part of the light about a bead that it does not take away, of the best fit.
+        seen: whether they were estimated, not assumed.
         true: the blur with which rendered beads look the same.
-        size: likewise the factor on the beads' radii.
-        lift: likewise the factor on the beads' contrast, of which blur takes a part.
+        size: the same for the factor on the beads' radii.
+        lift: the same for the factor on the beads' contrast, of which blur takes a part.
     """
 
     blur: float
@@ -88,8 +88,18 @@ class Sharp:
 def seen_sharpness(
     sharp: Sharp, patches: Patches, sample: npt.NDArray[np.intp], cone: ConeVec, model: BeadModel
 ) -> Sharp:
-    """Blur and size corrected by what the same estimate makes of rendered beads: the fit's profile
-    is an approximation, and where a spot is cut by the edge its radius decides its place."""
+    """Correct blur and size by the same estimate from rendered beads.
+
+    The fit's profile is an approximation, and where a spot is cut by the edge its radius
+    decides its place.
+
+    Args:
+        sharp: the estimate of the images.
+        patches: the windows.
+        sample: indices of complete spots.
+        cone: geometry of their frames.
+        model: the beads.
+    """
     if not sharp.seen or sharp.blur < BODY_BLUR_PX:
         return sharp
     trial = replace(sharp, true=sharp.blur, size=1.0)
@@ -119,7 +129,7 @@ def _as_rendered(
     """Estimate sharpness from beads that are rendered with a blur, a size and a contrast.
 
     Returns:
-        What is estimated, and the rendered contrast over that of the images.
+        The estimate, and the rendered contrast over that of the images.
     """
     k = patches.windows.corner.shape[1]
     frames, beads = np.divmod(sample, k)
@@ -143,10 +153,15 @@ def _as_rendered(
 
 
 def sharpness(patches: Patches, sample: npt.NDArray[np.intp], blur: float) -> Sharp:
-    """Blur, veil and apparent size from some whole spots, by the fit that leaves least.
+    """Estimate blur, veil and apparent size from some complete spots, by the best fit.
 
-    A bead that is not as made shows here too; a spot cut by the edge has its centre where its
-    radius puts it. Without whole spots: the assumed blur, and the expected size.
+    A bead of another size than described shows here too; a spot cut by the edge has its
+    centre where its radius puts it.
+
+    Args:
+        patches: the windows.
+        sample: indices of complete spots.
+        blur: assumed, with the expected size, if there are fewer than three [px].
     """
     if len(sample) < 3:
         return Sharp(blur, 1.0, 0.0, False, blur, 1.0)
@@ -188,7 +203,9 @@ def sharpness(patches: Patches, sample: npt.NDArray[np.intp], blur: float) -> Sh
 
 
 def _lowest(tried: FloatArray, misfit: FloatArray) -> float:
-    """Where a misfit is least: a hyperbola about the right place, so its square is a parabola."""
+    """Find the minimum of a misfit: a hyperbola about the right place, so its square is a
+    parabola.
+    """
     i = int(np.argmin(misfit))
     near = slice(i - 1, i + 2)
     if 0 < i < len(tried) - 1 and np.isfinite(misfit[near]).all():

@@ -1,7 +1,7 @@
 """Compiled measurement of one bead's spot in a window of a line-integral image.
 
-`measure` takes the centroid of a whole spot. `fit_ball` fits the profile of a ball to the usable
-part of a spot, and to spots in noisy images.
+`measure` takes the centroid of a complete spot. `fit_ball` fits the profile of a ball to
+the usable part of a spot, and to spots in noisy images.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ FIT_FLOOR_PX = 0.0025
 
 @linked
 def bias_factor(ratio, power):  # type: ignore[no-untyped-def]
-    """Sphere-centre bias of a centroid weighted by chord^power, chords capped at `ratio`.
+    """Return the sphere-centre bias of a centroid weighted by chord^power, chords capped
+    at `ratio`.
 
     0.8 for full chords (power 1), 2/3 for their squares, 1 for the outline: each level set of
     chords is the outline of a smaller concentric ball, displaced in proportion to its radius
@@ -42,7 +43,7 @@ def bias_factor(ratio, power):  # type: ignore[no-untyped-def]
 
 @linked
 def weight_power(noise):  # type: ignore[no-untyped-def]
-    """Power of the line integral that weighs the centroid, for a given noise of it.
+    """Return the power of the line integral that weights the centroid, for its noise.
 
     A ball's chord rises from its rim with a vertical slope, which pixels sample badly: a centroid
     weighted by the chord errs by 0.006 to 0.008 px even without noise, by its square 0.0015, by
@@ -60,7 +61,8 @@ def weight_power(noise):  # type: ignore[no-untyped-def]
 
 @linked
 def weight_cap(noise, peak, cap):  # type: ignore[no-untyped-def]
-    """Line integral at which the weight stops growing: the middle of a bead is the noisiest.
+    """Return the line integral above which the weight is constant: a bead's middle is the
+    noisiest.
 
     The noise of a logarithm grows as exp(L / 2) from `noise` at the background; above 0.3 it is of
     no use. Below that, a share of the peak (best of the same scan); without noise no cap at all.
@@ -74,7 +76,7 @@ def weight_cap(noise, peak, cap):  # type: ignore[no-untyped-def]
 
 @linked
 def raised(value, power):  # type: ignore[no-untyped-def]
-    """value^power with its sign, for the powers of `weight_power`."""
+    """Return value^power with its sign, for the powers of `weight_power`."""
     size = abs(value)
     if power == 2.0:
         return value * size
@@ -87,7 +89,7 @@ def raised(value, power):  # type: ignore[no-untyped-def]
 
 @linked
 def median(values, n):  # type: ignore[no-untyped-def]
-    """Median of the first n > 0 values, which it brings into another order (Hoare's quickselect).
+    """Compute the median of the first n > 0 values, which are reordered (Hoare's quickselect).
 
     numba's own takes three times as long to compile.
     """
@@ -120,9 +122,15 @@ def median(values, n):  # type: ignore[no-untyped-def]
 
 @linked
 def solve(matrix, right, out):  # type: ignore[no-untyped-def]
-    """Fill out with matrix @ out = right for a few unknowns: elimination with partial pivoting.
+    """Solve matrix @ out = right for a few unknowns into `out`: elimination with partial
+    pivoting.
 
-    LAPACK's, and the checks that numba puts before it, take seconds to compile.
+    LAPACK's solver, and the checks that numba adds to it, take seconds to compile.
+
+    Args:
+        matrix: (p, p).
+        right: (p,).
+        out: (p,), written.
     """
     n = out.size
     a = matrix.copy()
@@ -149,10 +157,19 @@ def solve(matrix, right, out):  # type: ignore[no-untyped-def]
 
 @linked
 def background(image, x0, y0, inner, outer, plane):  # type: ignore[no-untyped-def]
-    """Robust plane through the ring around (x0, y0): plane = (value, d/dx, d/dy); its noise.
+    """Fit a robust plane through the ring around (x0, y0), and return its noise.
 
-    The ring's median and spread come first, so that a neighbour or an edge in the ring does not
-    pull the plane. Returns -1 if too little of the ring lies in the image.
+    The ring's median and spread come first, so that a neighbour or an edge in the ring
+    does not pull the plane.
+
+    Args:
+        image: (rows, cols) line integrals.
+        x0, y0: centre [px].
+        inner, outer: radii of the ring [px].
+        plane: (3,) value, d/dx and d/dy, written.
+
+    Returns:
+        Standard deviation; -1 if too little of the ring is in the image.
     """
     rows, cols = image.shape
     left, right = max(0, math.floor(x0 - outer)), min(cols - 1, math.ceil(x0 + outer))
@@ -231,14 +248,16 @@ def background(image, x0, y0, inner, outer, plane):  # type: ignore[no-untyped-d
 
 @serial
 def measure(image, x0, y0, radius0, cap, least, result):  # type: ignore[no-untyped-def]
-    """Centroid of a whole spot near (x0, y0).
+    """Measure the centroid of a complete spot near (x0, y0).
 
     Args:
         image: (rows, cols) line integrals.
-        x0, y0: start [px]; radius0: expected radius of the spot [px].
-        cap: line integrals above background are cut at this, or lower if they are noisier.
-        least: noise is taken to be at least this, which decides how pixels are weighed.
-        result: filled, see the names of its places.
+        x0, y0: start [px].
+        radius0: expected radius of the spot [px].
+        cap: largest line integral above background; larger ones are cut, lower where they
+            are noisier.
+        least: least noise, which decides on the weight of pixels.
+        result: (RESULTS,), written; see the names of its places.
     """
     rows, cols = image.shape
     plane = np.zeros(3)
@@ -316,7 +335,21 @@ def measure(image, x0, y0, radius0, cap, least, result):  # type: ignore[no-unty
 
 @linked
 def _variance(image, x, y, reach, limit, noise, power, plane, cx, cy, mass, result):  # type: ignore[no-untyped-def]
-    """Covariance of a capped centroid: photon noise of a logarithm grows as exp(L / 2)."""
+    """Write the covariance of a capped centroid: photon noise of a logarithm grows as
+    exp(L / 2).
+
+    Args:
+        image: (rows, cols) line integrals.
+        x, y: centroid [px].
+        reach: radius of the used pixels [px].
+        limit: line integral at which values are cut.
+        noise: of the background.
+        power: of the weight.
+        plane: background about (cx, cy).
+        cx, cy: its origin [px].
+        mass: sum of the weights.
+        result: VAR_X, COV_XY and VAR_Y are written.
+    """
     vx, vxy, vy = 0.0, 0.0, 0.0
     for i in range(math.ceil(y - reach), math.floor(y + reach) + 1):
         for j in range(math.ceil(x - reach), math.floor(x + reach) + 1):
@@ -335,8 +368,21 @@ def _variance(image, x, y, reach, limit, noise, power, plane, cx, cy, mass, resu
 
 @linked
 def _likeness(image, x, y, radius, peak, cap, noise, plane, cx, cy):  # type: ignore[no-untyped-def]
-    """Correlation of the spot with a ball's profile within 1.3 radii, that of a spot without noise:
-    a faint ball is no less like one. At most three quarters of what is seen are taken for noise."""
+    """Return the correlation of the spot with a ball's profile within 1.3 radii,
+    corrected for noise.
+
+    A faint ball is no less like one. At most three quarters of the variance are taken for
+    noise.
+
+    Args:
+        image: (rows, cols) line integrals.
+        x, y, radius: of the spot [px].
+        peak: its contrast.
+        cap: line integral at which values are cut.
+        noise: of the background.
+        plane: background about (cx, cy).
+        cx, cy: its origin [px].
+    """
     limit = min(cap, peak)
     reach = 1.3 * radius + 1.0
     n, sa, sb, saa, sab, sbb = 0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -361,10 +407,18 @@ def _likeness(image, x, y, radius, peak, cap, noise, plane, cx, cy):  # type: ig
 
 @linked
 def ball_table(radius, peak, blur, veil, table, slope):  # type: ignore[no-untyped-def]
-    """Line integrals of a blurred ball along its radius in steps of 1/8 px, and their slope.
+    """Tabulate line integrals of a blurred ball along its radius in steps of 1/8 px, and
+    their slope.
 
-    The blur acts on intensities, before the logarithm, so a strong bead's spot looks smaller.
-    A veil is the part of the light about the ball that no ball takes away.
+    The blur acts on intensities, before the logarithm, so a strong bead's spot looks
+    smaller.
+
+    Args:
+        radius: of the ball [px].
+        peak: line integral through its middle.
+        blur: standard deviation [px].
+        veil: part of the light about the ball that no ball takes away.
+        table, slope: (n,), written.
     """
     n = table.shape[0]
     half = math.ceil(3.0 * blur * 8.0)
@@ -396,7 +450,15 @@ def ball_table(radius, peak, blur, veil, table, slope):  # type: ignore[no-untyp
 
 @linked
 def _level(image, mask, masked, x, y, inner, outer):  # type: ignore[no-untyped-def]
-    """Median of the usable pixels in a ring, 0 if there are none."""
+    """Return the median of the usable pixels in a ring, 0 without any.
+
+    Args:
+        image: (rows, cols).
+        mask: (rows, cols), 0 where a pixel must not be used.
+        masked: whether the mask counts.
+        x, y: centre [px].
+        inner, outer: radii of the ring [px].
+    """
     rows, cols = image.shape
     side = int(2 * outer + 3)
     values = np.empty(side * side)
@@ -416,15 +478,15 @@ def _level(image, mask, masked, x, y, inner, outer):  # type: ignore[no-untyped-
 def fit_ball(  # type: ignore[no-untyped-def]
     image, mask, x0, y0, radius, stretch, peak, blur, veil, sloped, free_radius, result
 ):
-    """Fit a blurred ball to the usable part of a spot, weighted as photons count.
+    """Fit a blurred ball to the usable part of a spot, weighted by photon counts.
 
-    Residuals are those of the intensity divided by its square root, which is what a Poisson
-    likelihood weighs; most of what is known about the place comes from the rim.
+    Residuals are those of the intensity divided by its square root, which is what a
+    Poisson likelihood weighs; most information about the place comes from the rim.
 
     Args:
         image: (rows, cols) line integrals.
         mask: (rows, cols) uint8, 0 where a pixel must not be used; or (0, 0): all may.
-        x0, y0: start [px]; the centre may lie outside the image.
+        x0, y0: start [px]; the centre may be outside the image.
         radius: minor semi-axis of the spot [px]; peak: line integral that is seen in its middle.
         stretch: (3,) direction of the major semi-axis (unit, column and row) and its ratio to the
             minor one.

@@ -1,7 +1,7 @@
-"""Windows around the positions where the beads are predicted: planned, cut out, mended, rendered.
+"""Windows around the predicted positions of the beads: planned, cut out, mended, rendered.
 
-With them the second measurement can subtract the phantom's body and the neighbouring beads without
-processing whole images.
+With them the second measurement can subtract the phantom's body and the neighbouring
+beads without processing entire images.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ LEAST_NOISE = 1e-3
 LEAST_SEEN = 4
 """Frames in which a pixel must be seen before it can be called dead."""
 STILL = 0.1
-"""Spread of a dead pixel's values over the frames, by the noise."""
+"""Largest spread of a dead pixel's values over the frames, in units of the noise."""
 STANDS_OUT = 5.0
-"""What a dead pixel differs by from its neighbours in some frame, by the noise."""
+"""Least difference of a dead pixel from its neighbours in some frame, in units of the noise."""
 WIDEST_DEAD = 4
 """Pixels along the shorter side of a gap that is filled."""
 
 
 @dataclass(frozen=True, eq=False)
 class Windows:
-    """Where to look in n frames for k beads.
+    """Windows in n frames around k beads.
 
     Attributes:
         corner: (n, k, 2) column and row of each window's first pixel.
@@ -45,7 +45,8 @@ class Windows:
         stretch: (n, k, 3) direction of the major semi-axis and its ratio to the minor.
         share: (n, k) share of each spot in the image, 0 to 1.
         crowded: (n, k) the spot touches another's.
-        whole: (n, k) the spot and some room round it are in the image, and it is alone.
+        whole: (n, k) the spot and some space around it are in the image, and no other
+            spot is.
         shape: (rows, cols).
     """
 
@@ -60,14 +61,14 @@ class Windows:
     shape: tuple[int, int]
 
     def pick(self, frames: npt.NDArray[np.intp], beads: npt.NDArray[np.intp]) -> Windows:
-        """Windows of m (frame, bead) pairs, as if of m frames with one bead each."""
+        """Select the windows of m (frame, bead) pairs, as if of m frames with one bead each."""
 
         arrays: dict[str, Any] = {n: a for n, a in vars(self).items() if n not in ("side", "shape")}
         return replace(self, **{n: a[frames, beads][:, None] for n, a in arrays.items()})
 
 
 def plan_windows(model: BeadModel, cone: ConeVec, shape: tuple[int, int]) -> Windows:
-    """Windows round the expected spots of all beads.
+    """Plan windows around the expected spots of all beads.
 
     Args:
         model: the beads.
@@ -99,7 +100,7 @@ def plan_windows(model: BeadModel, cone: ConeVec, shape: tuple[int, int]) -> Win
 def shadow_ellipses(
     model: BeadModel, cone: ConeVec, predicted: FloatArray, shape: tuple[int, int]
 ) -> tuple[FloatArray, FloatArray]:
-    """Minor semi-axes (n, k) [px] and (n, k, 3) direction and ratio of the major ones.
+    """Compute minor semi-axes (n, k) [px] and (n, k, 3) direction and ratio of the major ones.
 
     A ball's spot is the section of its tangent cone (half-angle beta, axis at theta from the
     detector's normal): semi-axes f sin b / sqrt(cos^2 t - sin^2 b) and, towards the foot point,
@@ -120,13 +121,17 @@ def shadow_ellipses(
 
 
 def _disc_share(t: FloatArray) -> FloatArray:
-    """Share of a unit disc on the near side of a line at signed distance `t` from its centre."""
+    """Return the share of a unit disc on the near side of a line at signed distance `t`
+    from its centre.
+    """
     s = np.clip(t, -1.0, 1.0)
     return np.asarray(0.5 + (s * np.sqrt(1.0 - s * s) + np.arcsin(s)) / math.pi)
 
 
 def crop(image: npt.ArrayLike, windows: Windows, frame: int) -> Float32Array:
-    """The k windows of one frame's image, float32 (k, side, side), nan outside the image."""
+    """Cut out the k windows of one frame's image, float32 (k, side, side), nan outside
+    the image.
+    """
     data = np.asarray(image)
     side = windows.side
     out = np.full((len(windows.corner[frame]), side, side), np.nan, dtype=np.float32)
@@ -137,7 +142,9 @@ def crop(image: npt.ArrayLike, windows: Windows, frame: int) -> Float32Array:
 
 
 def overlap(windows: Windows, frame: int, bead: int) -> tuple[Part, Part]:
-    """The rows and columns that a window shares with its image, in the window and in the image."""
+    """Return the rows and columns that a window shares with its image, in the window and
+    in the image.
+    """
     (rows, cols), side = windows.shape, windows.side
     x, y = windows.corner[frame, bead].tolist()
     left, top = max(x, 0), max(y, 0)
@@ -149,10 +156,15 @@ def overlap(windows: Windows, frame: int, bead: int) -> tuple[Part, Part]:
 
 
 def mended(images: Float32Array, windows: Windows) -> Float32Array:
-    """The windows (n, k, side, side) with dead pixels filled from their neighbours.
+    """Fill dead pixels of the windows from their neighbours.
 
-    A dead pixel shows the same in all frames, which noise allows no other pixel, and not what its
-    neighbours show. Parts of more than `WIDEST_DEAD` pixels are left: they may be starved.
+    A dead pixel is constant over the frames, which noise allows no other pixel, and
+    differs from its neighbours. Parts of more than `WIDEST_DEAD` pixels are left: they
+    may be starved.
+
+    Args:
+        images: (n, k, side, side) line integrals.
+        windows: their places.
     """
     side = windows.side
     noise = float(np.median(pixel_noise(images.reshape(-1, side, side), 0, side)))
@@ -187,8 +199,7 @@ def mended(images: Float32Array, windows: Windows) -> Float32Array:
 
 
 def _filled(image: Float32Array, dead: npt.NDArray[np.bool_]) -> Float32Array:
-    """An image whose dead pixels are means of those beside, above and below them, from the gaps'
-    edges inwards."""
+    """Fill dead pixels by the means of their four neighbours, from the gaps' edges inwards."""
     sides = np.pad(np.where(dead, np.float32(np.nan), image), 1, constant_values=np.nan)
     inner = sides[1:-1, 1:-1]
     for _ in range((WIDEST_DEAD + 1) // 2):
@@ -200,7 +211,7 @@ def _filled(image: Float32Array, dead: npt.NDArray[np.bool_]) -> Float32Array:
 
 
 def without_beads(scene: Scene, model: BeadModel) -> Scene:
-    """The scene less the balls that are the model's beads."""
+    """Remove the balls that are the model's beads from a scene."""
     return Scene(tuple(s for s in scene.solids if not _is_bead(s, model)))
 
 
@@ -213,12 +224,12 @@ def _is_bead(solid: Solid, model: BeadModel) -> bool:
 
 
 def render_windows(scene: Scene, cone: ConeVec, windows: Windows, fine: int = 1) -> Float32Array:
-    """Line integrals of a scene in every window, (n, k, side, side).
+    """Render line integrals of a scene in every window, (n, k, side, side).
 
     Args:
         scene: solids.
         cone: geometry.
-        windows: where.
+        windows: their places.
         fine: fine x fine rays in a pixel; their intensities are averaged, as a real pixel does.
             One ray puts an edge up to half a pixel off.
     """
@@ -228,8 +239,9 @@ def render_windows(scene: Scene, cone: ConeVec, windows: Windows, fine: int = 1)
 
 
 def window_intensities(scene: Scene, cone: ConeVec, windows: Windows, fine: int) -> Float32Array:
-    """Transmitted share of the open beam in every window, averaged over fine x fine rays a pixel,
-    (n, k, side, side)."""
+    """Render the transmitted share of the open beam in every window, averaged over fine x
+    fine rays a pixel, (n, k, side, side).
+    """
     n, k = windows.corner.shape[:2]
     total = np.zeros((n, k, windows.side, windows.side), dtype=np.float32)
     for place in lattice(fine):
@@ -238,7 +250,7 @@ def window_intensities(scene: Scene, cone: ConeVec, windows: Windows, fine: int)
 
 
 def lattice(fine: int) -> list[tuple[float, float]]:
-    """Places (column, row) of fine^2 rays in a pixel, from its centre.
+    """Return places (column, row) of fine^2 rays in a pixel, from its centre.
 
     A square grid turned so that no two rays share a column or a row: an edge along either is
     placed to 1 / fine^2 pixels, where a straight grid places it to 1 / fine.
@@ -254,7 +266,7 @@ def lattice(fine: int) -> list[tuple[float, float]]:
 def _window_rays(
     scene: Scene, cone: ConeVec, windows: Windows, place: tuple[float, float]
 ) -> Float32Array:
-    """Line integrals (n, k, side, side) for rays at a place in their pixels."""
+    """Render line integrals (n, k, side, side) for rays at a place in their pixels."""
     n, k = windows.corner.shape[:2]
     rows, cols = windows.shape
     side = windows.side
@@ -268,11 +280,11 @@ def _window_rays(
 
 
 def edged(body: Float32Array, windows: Windows, step: float) -> npt.NDArray[np.bool_]:
-    """Whether an edge of the body crosses a bead's spot or touches its rim, (n, k).
+    """Check whether an edge of the body crosses a bead's spot or touches its rim, (n, k).
 
     Args:
-        body: (n, k, side, side) line integrals of what is not the bead.
-        windows: where.
+        body: (n, k, side, side) line integrals of everything but the bead.
+        windows: their places.
         step: least height of an edge that counts.
     """
     # A ramp has no second difference; an edge has one of its height.
@@ -289,7 +301,8 @@ def edged(body: Float32Array, windows: Windows, step: float) -> npt.NDArray[np.b
 
 
 def distances2(corner: npt.NDArray[np.int64], side: int, places: FloatArray) -> FloatArray:
-    """Squared distances of the pixels of windows from a place each, (..., side, side) [px^2].
+    """Compute squared distances of the pixels of windows from a place each, (..., side,
+    side) [px^2].
 
     Args:
         corner: (..., 2) column and row of each window's first pixel.
@@ -302,7 +315,7 @@ def distances2(corner: npt.NDArray[np.int64], side: int, places: FloatArray) -> 
 
 
 def blur_kernel(blur: float) -> FloatArray:
-    """One-dimensional kernel on pixels whose variance is exactly blur^2 [px].
+    """Make a one-dimensional kernel on pixels whose variance is exactly blur^2 [px].
 
     A sampled Gaussian loses most of its variance below half a pixel.
     """
@@ -318,7 +331,7 @@ def blur_kernel(blur: float) -> FloatArray:
 
 
 def blurred_windows(line_integrals: Float32Array, blur: float) -> Float32Array:
-    """Line integrals (n, k, side, side) as they look when the intensity is blurred [px]."""
+    """Blur the intensity of line integrals (n, k, side, side) by a standard deviation [px]."""
     out = np.empty_like(line_integrals)
     side = line_integrals.shape[-1]
     kernel = blur_kernel(blur)
@@ -330,7 +343,7 @@ def blurred_windows(line_integrals: Float32Array, blur: float) -> Float32Array:
 
 
 def free_of_others(windows: Windows, frame: int, bead: int) -> npt.NDArray[np.bool_]:
-    """Where no other bead's spot falls in this window, (side, side)."""
+    """Mark pixels of this window that no other bead's spot touches, (side, side)."""
     d2 = distances2(windows.corner[frame, bead], windows.side, windows.predicted[frame])
     reach = windows.radii[frame] * windows.stretch[frame, :, 2] + 3.0
     touched = d2 < (reach**2)[:, None, None]
@@ -339,7 +352,9 @@ def free_of_others(windows: Windows, frame: int, bead: int) -> npt.NDArray[np.bo
 
 
 def pixel_noise(flat: Float32Array, edge: int, width: int) -> FloatArray:
-    """Noise of each window's pixels from neighbours in a few rows at its top and bottom, (m,)."""
+    """Estimate the noise of each window's pixels from neighbours in a few rows at its top
+    and bottom, (m,).
+    """
     rows = [edge, edge + 3, edge + 6, edge + width - 7, edge + width - 4, edge + width - 1]
     strips = flat[:, rows, edge : edge + width]
     steps = np.abs(np.diff(strips, axis=2)).reshape(len(flat), -1)
