@@ -1,4 +1,4 @@
-"""What is wrong with calibration data: a code for programs and a sentence for people."""
+"""Faults of calibration data: a code for programs and a sentence for people."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ class Finding:
 
 
 def error(code: str, text: str) -> Finding:
-    """A finding with which the numbers must not be used."""
+    """Make a finding with which the numbers must not be used."""
     return Finding(code, Severity.ERROR, text)
 
 
 def warning(code: str, text: str) -> Finding:
-    """A finding with which the numbers may be used."""
+    """Make a finding with which the numbers may be used."""
     return Finding(code, Severity.WARNING, text)
 
 
 def listed(finding: Finding | None) -> list[Finding]:
-    """Make a list of one finding, or of none."""
+    """Make a list of one finding; empty for `None`."""
     return [] if finding is None else [finding]

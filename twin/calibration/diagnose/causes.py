@@ -1,10 +1,11 @@
-"""Which causes the residuals have: one table of causes, judged by their evidence.
+"""Causes of the residuals: one table of causes, judged by their evidence.
 
-A cause is a group of columns beside those of the geometry, with a prior of unknown width: the
-phantom is strained, the object turns while it is exposed, beads are elsewhere, the panel distorts,
-a tile begins, something moves, priors are too narrow. Every combination that is tried has its
-evidence (`fit.evidence`). The most likely is fitted; what all of them say is averaged, so that what
-the data leave open stays in the sigmas; a cause is named where its odds exceed NAMED.
+A cause is a group of columns added to those of the geometry, with a prior of unknown
+width: the phantom is strained, the object turns while it is exposed, beads are elsewhere,
+the panel distorts, a tile begins, something moves, priors are too narrow. Every
+combination that is tried has its evidence (`fit.evidence`). The most likely is fitted;
+the results of all are averaged, so that the sigmas contain what the data leave open; a
+cause is named where its odds exceed NAMED.
 """
 
 from __future__ import annotations
@@ -42,31 +43,32 @@ OPEN: Final = math.log(100.0)
 CHANCE: Final = math.log(0.1)
 """Logarithm of the probability that a scan has a cause, before it is seen; assumed."""
 TOLD_CHANCE: Final = math.log(0.5)
-"""The same of a cause that the script says: images may be made of instants; assumed."""
+"""The same for a cause that the script states: images may be made of instants; assumed."""
 ARC_TOLERANCE: Final = 0.2
-"""Standard deviation of the squared share of a step that the script says, as a part of it: where
-in the exposure the trigger lies is not published; assumed."""
+"""Relative standard deviation of the squared share of a step that the script states: the
+trigger's place in the exposure is not published; assumed."""
 OUTLIER: Final = 5.0
-"""Residuals beyond so many robust standard deviations count as so many."""
+"""Robust standard deviations at which residuals are clipped."""
 STRAIN_WIDTHS: Final = (1e-3, 2.5e-3, 6e-3, 1.5e-2, 4e-2)
 BEAD_SHARES: Final = tuple(2e-4 * 2.0**k for k in range(8))
 """Widths of the beads' places as parts of the phantom's size."""
 PANEL_WIDTHS_PX: Final = tuple(0.004 * 2.5**k for k in range(9))
 MOTION_WIDTHS: Final = (1.0, 4.0, 16.0, 64.0)
-"""Of a motion, in standard deviations of what a whole scan tells of it."""
+"""Widths of a motion, in standard deviations of its estimate from an entire scan."""
 WAVES: Final = 8
-"""Shapes that a motion may have here: a ramp, and half waves in a scan."""
+"""Number of shapes of a motion here: a ramp, and half waves in a scan."""
 PRIOR_FACTORS: Final = (3.0, 10.0)
 PRIOR_CHANCE: Final = math.log(1e-3)
-"""The same that the scanner is so many times further off than is said; assumed."""
+"""Logarithm of the probability that the scanner is so many times further off than stated;
+assumed."""
 LEAST_MOVING: Final = 12
-"""Frames of a scan from which motion is told from noise."""
+"""Least number of frames in which motion is separable from noise."""
 MOST_ROUNDS: Final = 4
 MOST_BORDERS: Final = 2
 WEIGHED: Final = 12.0
-"""Models whose logarithmic evidence is lower by more have no weight."""
+"""Logarithm of the evidence ratio beyond which models have no weight."""
 NO_PANEL_PX: Final = 1e-4
-"""Width of the polynomials beside a tile's border where there is no other distortion."""
+"""Width of the polynomials at a tile's border without other distortion [px]."""
 SHAPES: Final = ("stretch", "shear")
 """The causes of a phantom of another shape."""
 MOTION_OF: Final = "motion of "
@@ -82,8 +84,8 @@ class Cause:
     """A cause that a scan may have.
 
     Attributes:
-        name: of it.
-        columns: of the table that it adds; none for the widths of the priors.
+        name: of the cause.
+        columns: of the table that it adds; empty for the widths of the priors.
         widths: of its columns that are tried.
         chance: logarithm of its probability before the scan is seen.
         always: width that it has where it is not chosen; 0: its columns are left out.
@@ -117,20 +119,21 @@ class Found:
     strain: tuple[FloatArray, FloatArray] | None = None
 
     def named(self, name: str) -> bool:
-        """Whether a cause of the fit is beyond doubt."""
+        """Check whether a cause of the fit is beyond doubt."""
         return name in self.applied and self.odds.get(name, -math.inf) > NAMED
 
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """What is said of the phantom and the positions.
+    """Statements on the phantom and the positions.
 
     Attributes:
         strain: priors of the phantom's stretches and shears, 0: it has its stated shape.
-        bead_tolerance_mm: of the request; None: unknown, 0: beads are where the phantom says.
+        bead_tolerance_mm: of the request; None: unknown, 0: beads are at their stated
+            places.
         floor: least standard deviation of whitened residuals.
-        arc: part of a step that the object turns in an exposure, as the script says, 0: it stands
-            still; None: nobody says it.
+        arc: part of a step that the object turns in an exposure, by the script, 0: it is
+            at rest; None: not stated.
     """
 
     strain: Strain
@@ -140,7 +143,7 @@ class Known:
 
 
 Refit = Callable[..., FitResult]
-"""Fit again with something else free: options of `fits_of_scans.refit_scans`."""
+"""Fits again with more parameters free: options of `fits_of_scans.refit_scans`."""
 
 
 class Candidates:
@@ -177,7 +180,7 @@ class Candidates:
         return [n for n in MOVING if n in self.fit.values]
 
     def _motion(self, name: str) -> Iterator[FloatArray]:
-        """Columns of unit length of a parameter that follows a ramp or half waves."""
+        """Yield columns of unit length of a parameter that follows a ramp or half waves."""
         problem = self.fit.problem
         n, k = problem.seen.shape
         slope = derivative(problem, self.fit, name, problem.seen).reshape(n, 2 * k)
@@ -189,6 +192,9 @@ class Candidates:
             yield (column / max(float(np.linalg.norm(column)), 1e-300))[:, None]
 
     def _causes(self, everything: FitProblem) -> tuple[Cause, ...]:
+        """List the causes of the table: shape, beads, arc, panel, borders, motion and
+        priors.
+        """
         layout, known = everything.layout, self.known
         out = []
         exact = known.bead_tolerance_mm == 0
@@ -226,7 +232,14 @@ class Candidates:
         return tuple(out)
 
     def judged(self, choice: Choice) -> Judged | None:
-        """Judge a choice; None where its columns cannot be told apart."""
+        """Judge a choice.
+
+        Args:
+            choice: width of each cause.
+
+        Returns:
+            The judged model, kept for later calls; None if its columns are not separable.
+        """
         if choice not in self._judged:
             factor = choice[-1] or 1.0
             columns = list(range(self.count))
@@ -248,12 +261,12 @@ class Candidates:
         return self._judged[choice]
 
     def evidence(self, choice: Choice) -> float:
-        """The logarithm of a choice's probability, but for a constant."""
+        """Return the logarithm of a choice's probability, up to a constant."""
         model = self.judged(choice)
         return -math.inf if model is None else model.evidence
 
     def best(self) -> Choice:
-        """The most likely choice, by changing one cause at a time from several starts."""
+        """Find the most likely choice, by changing one cause at a time from several starts."""
         nothing: Choice = (0.0,) * len(self.causes)
         singles = [
             with_pick(nothing, i, width)
@@ -282,7 +295,7 @@ class Candidates:
                 return choice
 
     def odds(self) -> dict[str, float]:
-        """Logarithm of the odds of each cause, from all choices judged."""
+        """Compute the logarithm of the odds of each cause, from all choices judged."""
         out = {}
         for i, cause in enumerate(self.causes):
             sides: list[list[float]] = [[], []]
@@ -293,11 +306,11 @@ class Candidates:
         return out
 
     def left_open(self, choice: Choice) -> tuple[FloatArray, FloatArray]:
-        """Covariance of the geometry's columns over all choices about one, and that of the choice
-        itself.
+        """Compute the covariance of the geometry's columns over all choices about one,
+        and that of the choice itself.
 
-        Choices with wider priors are left out: what is said of the scanner is believed where the
-        images do not contradict it.
+        Choices with wider priors are left out: statements on the scanner are believed
+        where the images do not contradict them.
         """
         at = self.judged(choice)
         assert at is not None
@@ -311,7 +324,9 @@ class Candidates:
         return spread, at.covariance(self.count)
 
     def strain(self, choice: Choice) -> tuple[FloatArray, FloatArray] | None:
-        """The phantom's strain (10,) in a choice, and its covariance; None where it has none."""
+        """Return the phantom's strain (10,) in a choice, and its covariance; None without
+        strain.
+        """
         at = self.judged(choice)
         if at is None or not min(self.known.strain) > 0:
             return None
@@ -320,14 +335,21 @@ class Candidates:
         return at.mean[own], at.covariance(last)[own, own]
 
     def width(self, choice: Choice, name: str) -> float:
-        """Width of a cause in a choice; 0: it is not chosen, or not in the table."""
+        """Return the width of a cause in a choice; 0: it is not chosen, or not in the table."""
         for cause, pick in zip(self.causes, choice, strict=True):
             if cause.name == name:
                 return pick
         return 0.0
 
     def border(self, choice: Choice) -> Border | None:
-        """A tile's border that a choice's residuals ask for."""
+        """Find a tile's border that a choice's residuals suggest.
+
+        Args:
+            choice: width of each cause.
+
+        Returns:
+            None if no border is likely, or the choice cannot be judged.
+        """
         model = self.judged(choice)
         shape = image_shape(self.fit)
         if model is None or shape is None:
@@ -347,11 +369,11 @@ class Candidates:
 
 
 def _arc(column: int, share: float | None) -> list[Cause]:
-    """Give the cause that the object turns while a frame is exposed; none where it stands still.
+    """Make the cause that the object turns while a frame is exposed; empty where it is at rest.
 
     Args:
         column: of the squared share of a step.
-        share: of a step, as the script says; None: nobody says it.
+        share: of a step, by the script; None: not stated.
     """
     if share is None:
         return [Cause("arc", (column,), (ARC_PRIOR,))]
@@ -361,11 +383,11 @@ def _arc(column: int, share: float | None) -> list[Cause]:
 
 
 def explained_by_causes(fit: FitResult, known: Known, refit: Refit) -> tuple[FitResult, Found]:
-    """The fit with the most likely causes as columns, sigmas averaged over those left open.
+    """Fit with the most likely causes as columns, and average sigmas over those left open.
 
     Args:
         fit: of the geometry, the phantom's strain with its prior.
-        known: what is said of the phantom and the positions.
+        known: statements on the phantom and the positions.
         refit: fits again with `strain`, `arc`, `bead_tolerance_mm` and `panel`.
     """
     first = fit
@@ -407,7 +429,7 @@ def explained_by_causes(fit: FitResult, known: Known, refit: Refit) -> tuple[Fit
 
 
 def _widened(fit: FitResult, candidates: Candidates, choice: Choice) -> FitResult:
-    """The fit with what the choices differ by in its covariance."""
+    """Add the differences of the choices to the covariance of a fit."""
     spread, own = candidates.left_open(choice)
     factor = [edge_factor(n) for n in fit.problem.layout.names[: candidates.count]]
     more = (spread - own) * np.outer(factor, factor)
@@ -421,7 +443,16 @@ def _widened(fit: FitResult, candidates: Candidates, choice: Choice) -> FitResul
 def _options(
     candidates: Candidates, choice: Choice, borders: Sequence[Border]
 ) -> dict[str, object]:
-    """What the refit is asked for; falsy where nothing is."""
+    """Make the options of the refit for a choice; falsy where nothing changes.
+
+    Args:
+        candidates: the table.
+        choice: width of each cause.
+        borders: of tiles.
+
+    Returns:
+        strain, arc, bead_tolerance_mm and panel.
+    """
     said = candidates.known.strain
     strain = tuple(candidates.width(choice, n) or w for n, w in zip(SHAPES, said, strict=True))
     beads = candidates.width(choice, "beads")
@@ -439,13 +470,15 @@ def _options(
 
 
 def image_shape(fit: FitResult) -> tuple[int, int] | None:
-    """(rows, cols) of the images; None where they differ."""
+    """Return (rows, cols) of the images; None where they differ."""
     sizes = np.unique(2 * fit.problem.origin + 1, axis=0)
     return (int(sizes[0, 1]), int(sizes[0, 0])) if len(sizes) == 1 else None
 
 
 def panel_of(fit: FitResult, borders: Sequence[Border]) -> PanelModel | None:
-    """Every term that a panel's distortion may have."""
+    """Make a panel model with every term that a distortion may have; None for images of
+    several shapes.
+    """
     shape = image_shape(fit)
     return None if shape is None else PanelModel(1.0, shape, tuple(borders))
 
@@ -456,12 +489,12 @@ def border_name(border: Border) -> str:
 
 
 def with_pick(choice: Choice, i: int, pick: float) -> Choice:
-    """A choice with another width of one cause."""
+    """Return a choice with another width of one cause."""
     return (*choice[:i], pick, *choice[i + 1 :])
 
 
 def _total(evidence: Sequence[float]) -> float:
-    """Logarithm of the sum of probabilities."""
+    """Compute the logarithm of the sum of probabilities."""
     if not evidence:
         return -math.inf
     top = max(evidence)
@@ -471,7 +504,16 @@ def _total(evidence: Sequence[float]) -> float:
 def _with_every_column(
     problem: FitProblem, x: FloatArray, panel: PanelModel | None
 ) -> tuple[FitProblem, FloatArray]:
-    """The problem with a column for every cause, and the columns' values where a fit has them."""
+    """Add a column for every cause to a problem.
+
+    Args:
+        problem: of the fit.
+        x: (c,) its column values.
+        panel: terms of distortion, or None.
+
+    Returns:
+        The problem, and values of all columns; 0 for those that the fit does not have.
+    """
     old = problem.layout
     count, k = old.parameter_count, len(problem.model)
     terms = () if panel is None else panel.names

@@ -33,34 +33,34 @@ GOOD_SHARE = 0.7
 GOOD_RMS_PX = 0.6
 """Residual of the first assignment above which another explanation is looked for."""
 OTHER_SIZE = 1.3
-"""Factor between seen and expected radii that is said of shadows that do not fit."""
+"""Factor between seen and expected radii from which the finding names the size."""
 STRAY_SHARE = 0.15
-"""Share of the frames in which another spot may lie where that of a lost bead would be."""
+"""Share of the frames in which another spot may be at the place of a lost bead."""
 SOME_SPOTS = 0.95
-"""Share of the spots that are beads below which it is said that others are there."""
+"""Share of the spots that are beads below which a finding names other spots."""
 MOST_LEFT_OUT = 12
 """Beads of a phantom of which each is left out in turn to see whether it is the cause."""
 WIDE_GATE_PX = 25.0
-"""Gate of an assignment of what may be moving."""
+"""Gate of an assignment to beads that may be moving [px]."""
 LEAST_FRAMES = 12
-"""Frames from which motion can be told from noise."""
+"""Least number of frames in which motion is separable from noise."""
 LEAST_TURN_DEG = 0.2
-"""Turn between two parts of a scan from which it is said."""
+"""Turn between two parts of a scan from which it is reported [deg]."""
 FEW_TURNED = math.radians(75.0)
 """Stated turn of the frames of which the true one is looked for."""
 TURNS = (0.5, 0.56, 0.62, 0.7, 0.8, 0.9, 1.1, 1.25, 1.4, 1.6, 1.8, 2.0)
-"""Factors of the angles that are tried; what lies between is fitted."""
+"""Trial factors of the angles; values between them are fitted."""
 LEAST_TURN = 0.04
-"""Share of a turn by which it must be wrong for that; what is less is found in other ways."""
+"""Least relative error of a turn for that; smaller ones are found in other ways."""
 TURN_WIDTH = {"angle_scale": 0.1}
-"""How far from them it may lie."""
+"""Standard deviation of the factor about a trial value."""
 SAMPLED = 8
-"""Frames that are looked at one by one."""
+"""Number of frames that are examined one by one."""
 
 SHOWN_AT_LEAST = 0.5
-"""Share of the frames in which another way to read the images must show spots to be said."""
+"""Least share of the frames with spots for another reading of the images to be reported."""
 SHOWN = 5
-"""Files that cannot be used and are named."""
+"""Largest number of unusable files that are named."""
 _STATES = {
     FrameState.MISSING: ("frames_missing", "missing"),
     FrameState.DARK: ("frames_dark", "dark"),
@@ -69,7 +69,13 @@ _STATES = {
 
 
 def judge_frames(scan: Scan, looks: Sequence[FrameSpots], sought: SpotFinder) -> list[Finding]:
-    """Missing and dark frames, and frames without any spot like those that were `sought`."""
+    """Judge missing and dark frames, and frames without a spot like the `sought` ones.
+
+    Args:
+        scan: gives the name.
+        looks: spots and state of each frame.
+        sought: sizes of spots.
+    """
     out, name = [], scan.name
     n = len(looks)
     for state, (code, what) in _STATES.items():
@@ -114,7 +120,13 @@ def _of_intensities(scan: Scan, sought: SpotFinder) -> str:
 def judge_emptiness(
     scans: Sequence[Scan], looks: Sequence[Sequence[FrameSpots]], model: BeadModel
 ) -> list[Finding]:
-    """Where no bead of the expected size was found: are there spots of another size?"""
+    """Look for spots of another size where no bead of the expected size was found.
+
+    Args:
+        scans: the scans.
+        looks: spots of each frame of each scan.
+        model: the beads.
+    """
     out = []
     for scan, some in zip(scans, looks, strict=True):
         if any(len(look.detections) for look in some):
@@ -142,7 +154,18 @@ def explain_identification(
     poses: Poses,
     name: str,
 ) -> Finding | None:
-    """Judge an assignment; if it is poor, find the mistake that explains the spots."""
+    """Judge an assignment; if it is poor, find the mistake that explains the spots.
+
+    Args:
+        found: the assignment; None if no one was found.
+        detections: spots of each frame.
+        model: the beads.
+        poses: nominal geometry.
+        name: of the scan.
+
+    Returns:
+        None for a good assignment.
+    """
     most = max((len(d) for d in detections), default=0)
     if most == 1:
         judged = warning if len(model) == 1 and found is not None else error
@@ -210,16 +233,19 @@ def explain_identification(
 
 
 def _extra(found: Identification, counts: npt.NDArray[np.intp]) -> bool:
-    """Whether most of the frames in which the beads are where they should be show other spots than
-    them; `counts` are those of all."""
+    """Check whether most frames with all beads in place have further spots; `counts` are
+    all spots.
+    """
     seen = (found.index >= 0).sum(axis=1)
     good = seen >= 0.7 * max(float(np.median(seen)), 1.0)
     return bool(np.mean(counts[good] > seen[good]) > 0.6)
 
 
 def _without_bad_frames(found: Identification) -> Identification:
-    """The assignment without single frames that the others contradict: after the fit they are
-    listed, and they are no sign of another phantom."""
+    """Drop single frames that the others contradict from an assignment.
+
+    After the fit they are listed; they do not suggest another phantom.
+    """
     seen = (found.index >= 0).sum(axis=1)
     usual = np.median(seen[seen > 0]) if seen.any() else 0
     bad = (seen > 0) & (seen <= 0.7 * usual)
@@ -229,7 +255,9 @@ def _without_bad_frames(found: Identification) -> Identification:
 
 
 def _missing(found: Identification) -> list[int]:
-    """Beads without any spot where every spot fits one of the others, at least three of them."""
+    """List beads without a spot where every spot fits one of the others, at least three
+    of them.
+    """
     if found.explained < GOOD_SHARE or not found.rms_px < GOOD_RMS_PX:
         return []
     share = (found.index >= 0).mean(axis=0)
@@ -270,7 +298,17 @@ def _alternative(
     model: BeadModel,
     poses: Poses,
 ) -> Finding | None:
-    """The first mistake under which phantom and spots agree."""
+    """Find the first mistake that makes phantom and spots agree.
+
+    Args:
+        found: the poor assignment, or None.
+        detections: spots of each frame.
+        model: the beads.
+        poses: nominal geometry.
+
+    Returns:
+        Its finding; None if no mistake explains the spots.
+    """
     n, k = len(poses), len(model)
     trials: list[tuple[str, str, dict[str, Any]]] = []
     for factor, true, said in ((n / (n - 1), n - 1, n), ((n - 1) / n, n, n - 1)) if n > 1 else ():
@@ -327,7 +365,16 @@ def _alternative(
 
 
 def _in_motion(detections: Sequence[Detections], model: BeadModel, poses: Poses) -> Finding | None:
-    """Whether the spots are those of the phantom, but for something that moves."""
+    """Check whether the spots are those of the phantom, up to a motion.
+
+    Args:
+        detections: spots of each frame.
+        model: the beads.
+        poses: nominal geometry.
+
+    Returns:
+        The finding that names the motion, or None.
+    """
     found = attempt(detections, model, poses, search=Search(gate_px=WIDE_GATE_PX))
     if found is None or min(found.explained, found.found) < GOOD_SHARE:
         return None
@@ -349,8 +396,14 @@ def _in_motion(detections: Sequence[Detections], model: BeadModel, poses: Poses)
 
 
 def _in_parts(detections: Sequence[Detections], model: BeadModel, poses: Poses) -> Finding | None:
-    """Whether the first or the last frames by themselves are those of the phantom; if both are, by
-    what they differ."""
+    """Check whether the first or the last frames alone fit the phantom; if both do, name
+    the change.
+
+    Args:
+        detections: spots of each frame.
+        model: the beads.
+        poses: nominal geometry.
+    """
     n = len(poses)
     ends: dict[str, tuple[slice, Offsets]] = {}
     for share in (2, 3, 4):
@@ -383,7 +436,13 @@ def _in_parts(detections: Sequence[Detections], model: BeadModel, poses: Poses) 
 
 
 def _other_turn(detections: Sequence[Detections], model: BeadModel, poses: Poses) -> Finding | None:
-    """Whether the stage turns by another angle than is stated, as neighbouring frames tell."""
+    """Check whether the stage turns by another angle than stated, from neighbouring frames.
+
+    Args:
+        detections: spots of each frame.
+        model: the beads.
+        poses: nominal geometry.
+    """
     turned = poses.angle - poses.angle[0]
     n = int(np.count_nonzero(np.abs(turned) <= FEW_TURNED))
     if n < 4:
@@ -405,7 +464,13 @@ def _other_turn(detections: Sequence[Detections], model: BeadModel, poses: Poses
 
 
 def _one_by_one(detections: Sequence[Detections], model: BeadModel, poses: Poses) -> Finding | None:
-    """Whether frames show the phantom each by itself."""
+    """Check whether frames fit the phantom one by one, though not together.
+
+    Args:
+        detections: spots of each frame.
+        model: the beads.
+        poses: nominal geometry.
+    """
     chosen = np.linspace(0, len(poses) - 1, SAMPLED).astype(int).tolist()
     good = 0
     for i in chosen:

@@ -30,7 +30,7 @@ from flexdt.twin.geometry.offsets import UNITS, to_edge
 OF_RESIDUALS = frozenset(
     ("drift", "vibration", "bead_errors", "bead_displaced", "too_many_outliers", "bead_tolerance")
 )
-"""Findings about what a fit leaves: they hold for that fit alone."""
+"""Codes of findings about residuals: they hold for that fit alone."""
 MISFIT_PX = 0.10
 """Residual of the final fit above which its numbers are not to be used unless explained."""
 AS_GOOD = 1.5
@@ -40,16 +40,16 @@ BLOCK_SHARE = 0.7
 MOST_USED = 0.9
 """Share of the positions below which a fit is good only because it left the others out."""
 NOISY = 1.5
-"""Residuals below so many of their stated sigmas are noise, however large."""
+"""Stated sigmas below which residuals are noise, however large."""
 SIZE = 0.04
-"""Deviation of the spots' radii from the expected ones that betrays a wrong scale."""
+"""Deviation of the spots' radii from the expected ones that indicates a wrong scale."""
 BLURRED = 0.6
-"""By how much more they may deviate, by the square of the blur over the radius (measured)."""
+"""Further deviation allowed, in units of the squared blur over radius (measured)."""
 BODY = 0.5
-"""Logarithm of the body's seen over its described attenuation from which that is said: beam
-hardening alone stays below."""
+"""Logarithm of the body's seen over its described attenuation from which it is reported:
+beam hardening alone stays below."""
 BODY_MM = 0.3
-"""Shift of the body from its description from which that is said [mm]."""
+"""Shift of the body from its description from which it is reported [mm]."""
 PLAUSIBLE_SHARE = 0.12
 """Largest offset along the beam, as a share of SOD, that a mount may cause. A phantom that is
 scaled together with its beads looks like the right one at another distance, so that this offset is
@@ -59,9 +59,9 @@ ALIKE_MOTION: Final = {
     "dO_y": "the source moves up or down, the other way",
     "dO_z": "the phantom grows or shrinks",
 }
-"""What looks like a motion of the object in the images."""
+"""Parameter -> other motions that look like this motion of the object."""
 OF_MOTION: Final = frozenset(("drift", "vibration", "angles_wrong"))
-"""What is called so may be followed from frame to frame."""
+"""Codes of findings on motion that may be followed from frame to frame."""
 EXPLAINED_PX: Final = 0.2
 """Residual that may remain of a motion that is named."""
 MOST_FRAMES: Final = 720
@@ -69,10 +69,15 @@ MOST_FRAMES: Final = 720
 
 
 def judge_places(fit: FitResult, looks: Sequence[Sequence[FrameSpots]]) -> Finding | None:
-    """Frames whose spots are not where the fit says: wrong angles, a slip, a repeated image.
+    """Judge frames whose spots are not at the fitted places: wrong angles, a slip, a
+    repeated image.
 
     Either most of a frame's spots are far from every prediction, or most of its positions had to
     be left out of the fit.
+
+    Args:
+        fit: to all frames.
+        looks: spots and state of each frame of each scan.
     """
     detections = [
         nothing(look.detections.shape) if look.state is FrameState.REPEATED else look.detections
@@ -122,7 +127,7 @@ def judge_places(fit: FitResult, looks: Sequence[Sequence[FrameSpots]]) -> Findi
 
 
 def judge_offsets(fit: FitResult) -> Finding | None:
-    """Is the fitted place within what a mount and motors can be off by?"""
+    """Judge whether the fitted place is within the possible errors of mount and motors."""
     sod = float(np.median(fit.problem.poses.sod))
     for parameters in fit.group_parameters:
         if abs(parameters.dO_z) > PLAUSIBLE_SHARE * sod:
@@ -137,10 +142,10 @@ def judge_offsets(fit: FitResult) -> Finding | None:
 def judge_first_size(
     found: Identification, looks: Sequence[FrameSpots], radii: FloatArray, allowed: float
 ) -> Finding | None:
-    """A coarse size check from the first measurement.
+    """Check sizes coarsely from the first measurement.
 
     Args:
-        found: which spot is which bead.
+        found: the bead of each spot.
         looks: of every frame.
         radii: (n, k) expected radii [px].
         allowed: deviation that may be blur.
@@ -156,10 +161,14 @@ def judge_first_size(
 
 
 def judge_size(measured: Refined, radius_px: float) -> Finding | None:
-    """Do the spots have the size the phantom's beads should cast at the fitted geometry?
+    """Judge the spots' size against the one of the phantom's beads at the fitted geometry.
 
-    A phantom of another scale at another distance gives the same bead positions; only the beads'
-    own size tells.
+    A phantom of another scale at another distance gives the same bead positions; only the
+    beads' own size reveals it.
+
+    Args:
+        measured: sizes and blur.
+        radius_px: expected radius of the spots.
     """
     off = abs(measured.size - 1.0)
     blur = measured.blur_px / radius_px
@@ -185,7 +194,7 @@ def _other_size(ratio: float) -> Finding:
 
 
 def judge_body(measured: Sequence[Refined]) -> Finding | None:
-    """Is the phantom's body where the phantom's description has it?"""
+    """Judge whether the phantom's body has its described place and attenuation."""
     bodies = [m.body for m in measured if np.isfinite(m.body.factor)]
     if any(body.factor == 0.0 for body in bodies):
         return warning(
@@ -207,7 +216,7 @@ def judge_body(measured: Sequence[Refined]) -> Finding | None:
 
 
 def judge_lag(lag: Lag) -> Finding:
-    """The camera shows part of the frame before."""
+    """Make the finding that the camera shows part of the frame before."""
     return warning(
         "lag",
         f"the camera still shows {100 * lag.part:.2g} % of the frame "
@@ -225,12 +234,12 @@ def explain_residuals(
     sigmas_known: bool,
     misfit_px: float = MISFIT_PX,
 ) -> tuple[FitResult, list[Finding]]:
-    """Judge the residuals of the final fit; name what would explain them.
+    """Judge the residuals of the final fit; name the causes that would explain them.
 
     Args:
         fit: to be judged.
-        known: what is said of the phantom and the positions.
-        refit: fits again with something else free.
+        known: statements on the phantom and the positions.
+        refit: fits again with more parameters free.
         sigmas_known: the positions' sigmas were measured, and are no more than compared.
         misfit_px: residual above which the fit explains nothing, if noise does not.
 
@@ -265,14 +274,14 @@ def explain_residuals(
 
 
 def _one_is_elsewhere(plain: FitResult, moved: FitResult) -> bool:
-    """Whether beads that a fit left out explain as much as places of all beads that were fitted."""
+    """Check whether beads that a fit left out explain as much as fitted places of all beads."""
     left_out = _lost_beads(plain)
     enough = bool(left_out) and not any(f.forbids for f in left_out)
     return enough and plain.certificate.rms_px < AS_GOOD * moved.certificate.rms_px
 
 
 def _drifts(fit: FitResult) -> list[Finding]:
-    """Drifts and jumps, strongest of each parameter."""
+    """List drifts and jumps, strongest of each parameter."""
     certificate, out = fit.certificate, []
     for drift in certificate.drifts[:1]:
         estimate = certificate.estimates.get(drift.column)
@@ -299,13 +308,13 @@ def _drifts(fit: FitResult) -> list[Finding]:
 
 
 def _looks_alike(column: str) -> str:
-    """What else looks like a change of a parameter."""
+    """Return words on other motions that look like a change of a parameter."""
     name = column.split("@")[0]
     return f" (or {ALIKE_MOTION[name]}, which looks alike)" if name in ALIKE_MOTION else ""
 
 
 def _lost_beads(fit: FitResult) -> list[Finding]:
-    """Beads that were left out in most of the frames they were seen in."""
+    """List beads that were left out in most of their frames."""
     problem, used = fit.problem, fit.certificate.used
     seen, kept = problem.seen.sum(axis=0), used.sum(axis=0)
     lost = np.flatnonzero((seen >= 3) & (kept < 0.5 * seen)).tolist()
@@ -319,7 +328,7 @@ def _lost_beads(fit: FitResult) -> list[Finding]:
 
 
 def _explained(better: FitResult, fit: FitResult) -> bool:
-    """Whether the residuals shrink to what may remain."""
+    """Check whether the residuals shrink enough."""
     rms = better.certificate.rms_px
     return (
         better.identifiable
@@ -330,6 +339,7 @@ def _explained(better: FitResult, fit: FitResult) -> bool:
 
 
 def _angle_scale(fit: FitResult, refit: Refit) -> Finding | None:
+    """Judge whether a factor on the angles explains the residuals; None if not."""
     if "angle_scale" in fit.certificate.estimates:
         return None
     better = refit(extra=("angle_scale",))
@@ -351,10 +361,10 @@ def _angle_scale(fit: FitResult, refit: Refit) -> Finding | None:
 
 
 def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding | None:
-    """Name what moves, if that explains the residuals.
+    """Name the moving parameter, if a motion explains the residuals.
 
     Args:
-        fit: in which nothing moves.
+        fit: without motion.
         refit: the fit to poses with a motion.
     """
     problem, before = fit.problem, fit.certificate.rms_px
@@ -402,7 +412,7 @@ def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding |
 
 
 def named_turn(turn_deg: float, angles: FloatArray) -> tuple[str, str]:
-    """What it is called if the object turns too far somewhere in a scan with `angles` [rad]."""
+    """Return code and words for an object that turns too far in a scan with `angles` [rad]."""
     step = abs(math.degrees(float(np.median(np.diff(angles)))))
     whole = round(turn_deg / step) if step else 0
     if whole and abs(turn_deg - whole * step) < 0.05 * step:
@@ -416,7 +426,7 @@ def named_turn(turn_deg: float, angles: FloatArray) -> tuple[str, str]:
 
 
 def _shape(curve: FloatArray) -> tuple[str, int | None]:
-    """How a parameter moves, and after which frame it jumps if it does."""
+    """Describe how a parameter moves, and return the frame before a jump, or None."""
     steps = np.abs(np.diff(curve))
     jump = int(np.argmax(steps))
     sides = [side for side in (curve[: jump + 1], curve[jump + 1 :]) if len(side)]

@@ -1,4 +1,4 @@
-"""Checks whether what is not estimated freely is where the data have it.
+"""Checks whether parameters that are not estimated freely agree with the data.
 
 A main parameter that is fixed at a wrong value shifts the others, and free bead positions can hide
 that: the residuals look right and the answer is wrong. So it is compared with a fit in which it is
@@ -24,26 +24,27 @@ from flexdt.twin.geometry.offsets import to_edge
 HELD_SIGMAS: Final = 5.0
 """How far, in standard deviations, the data may have a fixed parameter from where it is fixed."""
 DOUBT_SIGMAS: Final = 2.3
-"""Beyond this the intervals of what is free contain what the fixed ones would change."""
+"""Sigmas beyond which the intervals of free parameters contain the change by fixed ones."""
 LOOSE: Final = 10.0
-"""Priors are compared with a fit in which they are so many times as wide."""
+"""Factor on the priors in the fit with which they are compared."""
 ALIKE: Final = 9.0
-"""Causes whose chi2 differ by less are both possible: three standard deviations."""
+"""Difference of chi2 below which two causes are both possible: three standard deviations."""
 MOST_TOLD: Final = 0.5
-"""Images that lower the variance of such a loose prior by a smaller share say nothing about it. (At
-0.9 an SDD 13 mm off its prior of 1 mm, which images told to 5 mm, was offered 12 sigmas off.)"""
+"""Least share by which images must lower the variance of such a loose prior to count. (At
+0.9 an SDD 13 mm off its prior of 1 mm, determined to 5 mm by images, was offered 12
+sigmas off.)"""
 EXACT: Final = 3.0
-"""What is said to be exact and cannot be checked is named where a sigma would be so much larger,
-or where images narrow its usual prior by less."""
+"""Growth of a sigma from which values stated as exact are named, if they cannot be
+checked, or if images narrow their usual prior by less."""
 NARROW: Final = 0.01
-"""Priors are widened where right ones would be contradicted as much less often than that."""
+"""Probability of such a contradiction with right priors below which priors are widened."""
 
 
 def held_distance(free: FitResult, held: Mapping[str, float]) -> dict[str, float]:
-    """How far, in sigmas, the data have each fixed parameter from where it is fixed.
+    """Compute the distance of the data, in sigmas, from the value of each fixed parameter.
 
     Args:
-        free: the fit with those parameters free as well.
+        free: the fit with those parameters free too.
         held: parameter -> value it is fixed at, edge units; those not determined are left out.
 
     Returns:
@@ -67,9 +68,13 @@ def held_distance(free: FitResult, held: Mapping[str, float]) -> dict[str, float
 
 
 def judge_held(free: FitResult, held: Mapping[str, float]) -> Finding | None:
-    """An error if the data contradict what is fixed (see `held_distance`), else None.
+    """Return an error if the data contradict fixed parameters (see `held_distance`), else None.
 
     It names each parameter that is off by itself, or the worst where only all together are.
+
+    Args:
+        free: the fit with those parameters free too.
+        held: parameter -> value it is fixed at, edge units.
     """
     scores = held_distance(free, held)
     if not scores or max(scores.values()) <= HELD_SIGMAS:
@@ -86,14 +91,14 @@ def judge_held(free: FitResult, held: Mapping[str, float]) -> Finding | None:
 
 @dataclass(frozen=True)
 class PriorsJudged:
-    """What the images say of the priors.
+    """The priors compared with the images.
 
     Attributes:
         finding: an error where they contradict them by more than HELD_SIGMAS, else None.
         factor: by how much the priors are too narrow as a whole; 1 unless chance would have the
             images contradict them as much only once in a hundred scans.
-        causes: parameters of which one alone, elsewhere than its prior has it, would explain what
-            the images show, best first; none unless doing without its prior explains DOUBT_SIGMAS.
+        causes: parameters of which one alone, away from its prior, would explain the
+            images, best first; empty unless dropping its prior explains DOUBT_SIGMAS.
     """
 
     finding: Finding | None
@@ -102,12 +107,12 @@ class PriorsJudged:
 
 
 def loosened(priors: Mapping[str, float], factor: float = LOOSE) -> dict[str, float]:
-    """Priors `factor` times as wide."""
+    """Widen priors by a factor."""
     return {name: width * factor for name, width in priors.items()}
 
 
 def judge_exact(fit: FitResult, freed: FitResult, exact: Mapping[str, float]) -> Finding | None:
-    """What hangs on values that are said to be exact, and that the images cannot check.
+    """Judge the dependence on values stated as exact that the images cannot check.
 
     Args:
         fit: with those values.
@@ -115,9 +120,10 @@ def judge_exact(fit: FitResult, freed: FitResult, exact: Mapping[str, float]) ->
         exact: parameter -> value, edge units.
 
     Returns:
-        An error if the images contradict one of them by itself, a warning if they do not tell and
-        sigmas depend on it, else None. (All together are not judged: who calls ten values exact
-        gets their small systematic parts, such as a blurred bead's, summed up.)
+        An error if the images contradict one of them by itself, a warning if they cannot
+        decide and sigmas depend on it, else None. (All together are not judged: who calls
+        ten values exact gets their small systematic parts, such as a blurred bead's,
+        summed up.)
     """
     if not (fit.identifiable and freed.identifiable):
         return None
@@ -152,14 +158,15 @@ def judge_priors(loose: FitResult, exact: Container[str] = ()) -> PriorsJudged:
     """Compare priors with the images.
 
     Args:
-        exact: parameters that the request calls exact; their priors in `loose` are the usual ones.
+        exact: parameters that the request states as exact; their priors in `loose` are
+            the usual ones.
         loose: the fit with `loosened` priors. (In a fit with the priors themselves, strong ones
             that are wrong leave residuals with structure, which widens the sigmas until nothing is
             contradicted.)
 
-    In units of its loose prior an estimate of covariance C moves from the prior's centre by
-    K = 1 - C times what the parameter is off, and by noise of covariance C K. Directions of which
-    the images say less than the loose prior are left out.
+    In units of its loose prior an estimate of covariance C moves from the prior's centre
+    by K = 1 - C times the error of the parameter, and by noise of covariance C K.
+    Directions that the images determine less than the loose prior are left out.
     """
     c = loose.certificate
     known = [(i, n, e) for i, (n, e) in enumerate(c.estimates.items()) if e.prior is not None]
@@ -237,14 +244,15 @@ def _other_pixels(fit: FitResult, dD_z: float) -> str:
 def doubtful(
     fit: FitResult, judged: PriorsJudged, without: Callable[[str], FitResult]
 ) -> FitResult:
-    """The fit with intervals that contain what each possible cause alone would change.
+    """Widen the intervals by the change that each possible cause alone would make.
 
-    Images that contradict the priors say which combination of parameters is off, and the widths of
-    the priors how much of it is whose: the narrower is believed, although it may be the wrong one.
+    Images that contradict the priors determine the wrong combination of parameters, and
+    the widths of the priors divide it among them: the narrower is believed, although it
+    may be the wrong one.
 
     Args:
         fit: with the priors.
-        judged: what the images say of them.
+        judged: the priors compared with the images.
         without: makes the fit without the prior of a parameter.
     """
     for name in judged.causes:
@@ -256,7 +264,7 @@ def doubtful(
 
 
 def narrow_priors(judged: PriorsJudged) -> Finding:
-    """What is said where the priors are widened by the factor of `judged`."""
+    """Make the finding that the priors are widened by the factor of `judged`."""
     cause = f"; {' or '.join(judged.causes)} alone would explain it" if judged.causes else ""
     return warning(
         "priors_narrow",

@@ -1,8 +1,9 @@
-"""Which angle each frame really shows: lost, doubled and exposed-again frames.
+"""The angle that each frame really shows: lost, doubled and exposed-again frames.
 
-The number of the angle that a frame shows, less its own number, is hidden and mostly stays from
-frame to frame. The most likely sequence (Viterbi, IEEE Trans. Inf. Theory 13 (1967) 260) is found
-from how far each frame's spots lie from where the beads appear at neighbouring angles.
+The number of the angle that a frame shows, less its own number, is hidden and mostly
+stays from frame to frame. The most likely sequence (Viterbi, IEEE Trans. Inf. Theory 13
+(1967) 260) is found from the distances of each frame's spots from the beads' places at
+neighbouring angles.
 """
 
 from __future__ import annotations
@@ -26,17 +27,17 @@ MOST_SHIFT: Final = 6
 CHANGE: Final = math.log(1e3)
 """Cost of another shift than the frame's before; assumed: one frame in a thousand."""
 ASTRAY: Final = math.log(1e3)
-"""Cost of a spot that is none of the beads."""
+"""Cost of a spot that belongs to no bead."""
 GOOD_SHARE: Final = 0.8
 """Part of the frames that must show the phantom at the angles found."""
 LEAST_SPREAD_PX: Final = 0.05
 SHOWN: Final = 6
-"""Changes that are listed."""
+"""Largest number of changes that are listed."""
 
 
 @dataclass(frozen=True, eq=False)
 class FrameNumbers:
-    """What the frames of a scan show.
+    """Numbers of the angles that the frames of a scan show.
 
     Attributes:
         shift: (n,) number of the angle that a frame shows, less its own, 0 in the first frame.
@@ -67,7 +68,14 @@ class FrameNumbers:
         return out
 
     def judged(self, name: str) -> Finding | None:
-        """Say what is wrong with the numbers of the scan `name`; None: nothing."""
+        """Make the finding on wrong numbers of frames.
+
+        Args:
+            name: of the scan.
+
+        Returns:
+            None if all numbers are right.
+        """
         if not self.renumbered:
             again = self.again.tolist()
             if not again:
@@ -111,14 +119,14 @@ def frame_numbers(
     offsets: Offsets,
     spread_px: float,
 ) -> FrameNumbers | None:
-    """Find which angle each frame shows; None where the beads do not tell.
+    """Find the angle that each frame shows; None where the beads do not determine it.
 
     Args:
         detections: spots of each of the n frames.
         beads: (k, 3) [mm].
         poses: nominal geometry.
         offsets: geometry that most frames agree with.
-        spread_px: by which spots lie from where the beads appear.
+        spread_px: distance of spots from the beads' projections.
     """
     n = len(poses)
     shifts = np.arange(-MOST_SHIFT, MOST_SHIFT + 1)
@@ -147,7 +155,7 @@ def frame_numbers(
 
 
 def _angles(angle: FloatArray, shift: int) -> FloatArray:
-    """Angles of frames `shift` numbers further on; beyond the ends, the steps go on."""
+    """Return angles of frames `shift` numbers further on; beyond the ends, the steps go on."""
     n = len(angle)
     first, last = angle[1] - angle[0], angle[-1] - angle[-2]
     beyond = np.arange(1, MOST_SHIFT + 1)
@@ -156,7 +164,7 @@ def _angles(angle: FloatArray, shift: int) -> FloatArray:
 
 
 def _likeliest(costs: FloatArray) -> npt.NDArray[np.intp]:
-    """The path (n,) of least cost through (n, states), changes included."""
+    """Find the path (n,) of least cost through (n, states), changes included."""
     n, states = costs.shape
     total = costs[0].copy()
     came = np.zeros((n, states), dtype=np.intp)

@@ -1,4 +1,4 @@
-"""What is said of the causes that were found in the residuals."""
+"""Findings on the causes of the residuals."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SPOKEN: Final = {
     "arc": "a stage that turns while a frame is exposed",
     "panel": "a panel that distorts",
 }
-"""Causes that may be left open, in words."""
+"""Cause that may be left open -> its words."""
 ALIKE: Final = ("arc", "beads", "panel")
 """Causes that may look like a phantom of another shape."""
 TERMS: Final[dict[str, dict[str, float]]] = {
@@ -32,7 +32,7 @@ TERMS: Final[dict[str, dict[str, float]]] = {
     "aslant along y": {"yz": 1.0},
     "tilted along y": {"zy": 1.0},
 }
-"""What is said of a strain, and how it follows from STRAINS."""
+"""Words on a strain -> its weights of STRAINS."""
 PARTS: Final[dict[str, FloatArray]] = {
     name: np.array([terms.get(term, 0.0) for term in STRAINS]) for name, terms in TERMS.items()
 }
@@ -74,7 +74,9 @@ def named_causes(fit: FitResult, plain: FitResult, found: Found) -> list[Finding
 
 
 def _strained(found: Found) -> Finding | None:
-    """By how much the phantom is strained beside its scale, which images do not tell."""
+    """Make the finding on the phantom's strain other than its scale, which images do not
+    determine.
+    """
     if found.strain is None:
         return None
     mean, covariance = found.strain
@@ -101,7 +103,7 @@ def _strained(found: Found) -> Finding | None:
 
 
 def _turning(fit: FitResult) -> Finding:
-    """How long the exposures last."""
+    """Make the finding on the length of the exposures."""
     layout = fit.problem.layout
     share = float(np.sqrt(max(fit.solution.x[layout.arc_column], 0.0)))
     step = np.degrees(np.median(np.abs(np.diff(fit.problem.poses.angle))))
@@ -114,7 +116,7 @@ def _turning(fit: FitResult) -> Finding:
 
 
 def _elsewhere(fit: FitResult) -> Finding:
-    """How far beads are from the phantom's model."""
+    """Make the finding on beads away from the phantom's model."""
     moved = np.linalg.norm(fit.beads - fit.problem.model.beads, axis=1)
     return warning(
         "bead_tolerance",
@@ -124,7 +126,7 @@ def _elsewhere(fit: FitResult) -> Finding:
 
 
 def _distorted(fit: FitResult) -> Finding:
-    """By how much the panel distorts, and where tiles begin."""
+    """Make the finding on the panel's distortion, and its tiles."""
     panel = fit.panel
     assert panel is not None
     rows, cols = panel.model.shape

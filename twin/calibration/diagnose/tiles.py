@@ -30,7 +30,8 @@ def likely_border(
     shape: tuple[int, int],
     known: Sequence[Border],
 ) -> Border | None:
-    """The border whose shift explains most of what columns leave; None where it is chance.
+    """Find the border whose shift explains most of the residuals of columns; None if it
+    is chance.
 
     Args:
         rows: (2 m, c) of the columns.
@@ -41,7 +42,7 @@ def likely_border(
             part the positions of a bead that keeps its row by their noise.
         whiten: (m, 3) of the positions.
         shape: (rows, cols) of the image.
-        known: borders that are there already.
+        known: borders found before.
     """
     m = len(places)
     weight = np.where(np.isinf(widths), 0.0, noise / widths)
@@ -85,7 +86,7 @@ def likely_border(
 
 
 def _allowed(at: FloatArray, side: int, known: Sequence[float]) -> npt.NDArray[np.bool_]:
-    """Borders that leave every tile its least width."""
+    """Mark borders that leave every tile its least width."""
     least = LEAST_TILE * side
     out = (at > least) & (at < side - least)
     for other in known:
