@@ -1,9 +1,9 @@
 """The uncertainty report of a fit: covariance, rank, weak directions, residuals.
 
-Everything is computed from the whitened Jacobian and the residuals at the solution. The covariance
-is s^2 (J'J)^-1 from reprojection residuals alone. Where residuals are correlated from frame to
-frame, it is enlarged by their correlation length, and the report says so. `diagnose` looks for the
-causes.
+Everything is computed from the whitened Jacobian and the residuals at the solution. The
+covariance is s^2 (J'J)^-1 from reprojection residuals alone. Where residuals are
+correlated from frame to frame, it is enlarged by their correlation length, and the report
+states it. `diagnose` looks for the causes.
 """
 
 from __future__ import annotations
@@ -43,23 +43,23 @@ from flexdt.twin.geometry.conventions import FloatArray
 RANK_TOLERANCE = 1e-8
 """Singular values of the column-scaled Jacobian below this share of the largest are zero."""
 ROUNDING = 1e-9
-"""Residuals of exact positions [whitened]; what they follow is rounding."""
+"""Residuals of exact positions [whitened] below which structure is rounding."""
 LEAST_FREEDOM = 1e-3
 """Degrees of freedom from which the residuals have a spread."""
 ROUNDING_OF_COLUMNS = 1e-13
-"""Of the scaled normal equations: a direction that says less is not determined at all."""
+"""Least eigenvalue of the scaled normal equations; directions below it are undetermined."""
 SOURCES = {
     "bead": "beads",
     "strain": "the phantom's scale",
     "arc": "the exposure's arc",
     "panel": "the panel's distortion",
 }
-"""What columns that are no parameters belong to, by the first word of their names."""
+"""First word of a column's name that is no parameter -> its source, in words."""
 MEASURE = {
     SOURCES["bead"]: "beads measured more exactly would tell more",
     SOURCES["strain"]: "a measured distance of two beads, and --bead-tolerance, would tell more",
 }
-"""What tells more where a sigma is limited by one of them."""
+"""Source that limits a sigma -> the measurement that would reduce it."""
 WEAK_CONDITION = 500.0
 """A column-scaled condition number above this makes the smallest direction weak."""
 
@@ -108,7 +108,7 @@ def spectrum(
     Args:
         jacobian: rows.
         names: columns.
-        beads: how many beads were seen, for the advice.
+        beads: number of beads seen, for the advice.
         noise: standard deviation of the whitened residuals, for the sigmas of weak directions.
         reported: only the first `reported` columns are judged (the rest are nuisance).
         bound: a direction known worse than this [mm, deg; 0.0025 of it in angle_scale] counts as
@@ -164,7 +164,7 @@ def spectrum(
 
 
 def _singular(j: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Singular values, largest first, and right singular vectors (rows) of (m, p).
+    """Compute singular values, largest first, and right singular vectors (rows) of (m, p).
 
     From the Gram matrix where that is accurate (it squares the condition number), else by QR.
     """
@@ -189,8 +189,9 @@ class Estimate:
         priors: standard deviation that the prior of each other parameter (or "beads") causes,
             largest first; sigma^2 is the sum of all squares. Those below a tenth of sigma are left
             out.
-        prior: standard deviation of this parameter's own prior; None: it has none.
-        asked: it was to be estimated; otherwise it is estimated for the sake of the others.
+        prior: standard deviation of this parameter's own prior; None: without one.
+        asked: whether it was requested; otherwise it is estimated for the sake of the
+            others.
     """
 
     value: float
@@ -253,7 +254,7 @@ class Certificate:
 
     @property
     def identifiable(self) -> bool:
-        """Every asked parameter is determined by the data."""
+        """Whether the data determine every requested parameter."""
         return self.spectrum.full
 
     @property
@@ -263,8 +264,9 @@ class Certificate:
 
     @property
     def limited(self) -> dict[str, str]:
-        """What limits each parameter that was asked for and owes most of its sigma to priors, and
-        which measurement would tell more."""
+        """Requested parameter that owes most of its sigma to priors -> the limit, and the
+        measurement that would reduce it.
+        """
         out = {}
         for name, e in self.estimates.items():
             if e.asked and e.sigma**2 > 2 * e.images**2 and e.priors:
@@ -300,27 +302,29 @@ class Certificate:
             return np.asarray(np.sqrt(square.sum(axis=(axis, 2)) / count))
 
     def mahalanobis2(self, truth: Mapping[str, float]) -> float:
-        """Squared distance of `truth` (edge units, some or all reported columns) in the covariance
-        of those columns."""
+        """Compute the squared distance of `truth` (edge units, some or all reported
+        columns) in the covariance of those columns.
+        """
         names = list(self.estimates)
         at = [names.index(n) for n in truth]
         d = np.array([v - self.estimates[n].value for n, v in truth.items()])
         return float(d @ np.linalg.solve(self.covariance[np.ix_(at, at)], d))
 
     def inside_95(self, truth: Mapping[str, float]) -> bool:
-        """Whether `truth`, arguments as `mahalanobis2`, lies in the joint 95 % ellipsoid of its
-        columns (Hotelling: F distribution)."""
+        """Check whether `truth`, arguments as `mahalanobis2`, is in the joint 95 %
+        ellipsoid of its columns (Hotelling: F distribution).
+        """
         p = len(truth)
         return self.mahalanobis2(truth) <= p * float(fdtri(p, self.dof, 0.95))
 
 
 def widened(certificate: Certificate, more: FloatArray | Mapping[str, float]) -> Certificate:
-    """The certificate with a covariance added.
+    """Add a covariance to a certificate.
 
     Args:
         certificate: of a fit.
-        more: (p, p) covariance of what the images leave open, edge units; or column -> how far it
-            may be off: (off) (off)'.
+        more: (p, p) covariance that the images leave open, edge units; or column -> its
+            possible error: (off) (off)'.
     """
     images = np.array([e.images for e in certificate.estimates.values()])
     if isinstance(more, Mapping):
@@ -353,7 +357,7 @@ def certify(
     sampling_px: float = 0.0,
     bound: float = BOUND,
 ) -> Certificate:
-    """Certificate of column values `x` fitted to the positions `use`.
+    """Make the certificate of column values `x` fitted to the positions `use`.
 
     Args:
         problem: the data.
@@ -365,9 +369,9 @@ def certify(
             frame keep it; on beads that wander it averages out.
         bound: see `spectrum`.
 
-    The estimate x = U (J' y + W b) with U = (J'J + W)^-1 errs by U J' times the noise of the images
-    and by U W times the error of the prior means b. The covariance is the sum of both, and what
-    the residuals show beyond white noise enlarges the first alone.
+    The estimate x = U (J' y + W b) with U = (J'J + W)^-1 errs by U J' times the noise of
+    the images and by U W times the error of the prior means b. The covariance is the sum
+    of both, and residuals beyond white noise enlarge only the first.
     """
     names = problem.layout.names
     reported = problem.layout.parameter_count
@@ -455,7 +459,9 @@ def certify(
 
 
 def _of_what_was_asked(given: Conditioning, whole: Conditioning) -> Conditioning:
-    """`given` with the covariance and the open directions of `whole`, which has more columns."""
+    """Replace covariance, rank and null directions of `given` by those of `whole`, with
+    more columns.
+    """
     rank = min(given.rank, len(given.names) - len(whole.null))
     return replace(given, unit_covariance=whole.unit_covariance, rank=rank, null=whole.null)
 
@@ -463,11 +469,13 @@ def _of_what_was_asked(given: Conditioning, whole: Conditioning) -> Conditioning
 def spread_of_residuals(
     problem: FitProblem, x: FloatArray, use: npt.NDArray[np.bool_], prior_noise: float
 ) -> tuple[float, float]:
-    """Give the standard deviation of the whitened residuals at `x`, and its degrees of freedom.
+    """Compute the standard deviation of the whitened residuals at `x`, and its degrees of
+    freedom.
 
-    A column costs the part of a degree of freedom that the images, not its prior, determine
-    (MacKay, Neural Computation 4 (1992) 415): a wide prior costs a whole one. Where priors are
-    moved by more than that to fit the images, what they are moved by counts as residuals.
+    A column costs the part of a degree of freedom that the images, not its prior,
+    determine (MacKay, Neural Computation 4 (1992) 415): a wide prior costs a full one.
+    Where priors are moved by more than that to fit the images, their shifts count as
+    residuals.
 
     Args:
         problem: the data.
@@ -476,7 +484,7 @@ def spread_of_residuals(
         prior_noise: spread of the whitened residuals with which the priors were weighed.
 
     Returns:
-        The standard deviation, nan if there are no degrees of freedom, and how many there are.
+        The standard deviation, nan without degrees of freedom, and their number.
     """
     _, _, norms, _, upper, _ = problem.evaluate(x, use, 1)
     told = upper + np.triu(upper, 1).T
@@ -492,7 +500,7 @@ def spread_of_residuals(
 
 
 def _determined(told: FloatArray, weight: FloatArray) -> float:
-    """Give how many columns the images determine.
+    """Count the columns that the images determine.
 
     Args:
         told: (c, c) normal equations of the images.
@@ -508,7 +516,9 @@ def _determined(told: FloatArray, weight: FloatArray) -> float:
 
 
 def _shares(names: Sequence[str], pull: FloatArray, sigma: float) -> dict[str, float]:
-    """What each prior adds to a sigma, largest first; those of one source together."""
+    """Compute the part of a sigma from each prior, largest first; those of one source
+    together.
+    """
     square: dict[str, float] = {}
     for name, value in zip(names, pull.tolist(), strict=True):
         kind = name.split(" ")[0]
@@ -525,10 +535,18 @@ def _widened(
     prior: FloatArray,
     sampling_px: float,
 ) -> tuple[FloatArray, tuple[bool, bool], tuple[Drift, ...]]:
-    """The covariance with what the residuals show beyond white noise; whether the beads of a frame
-    err together, and whether errors repeat with the turn; and drifts.
+    """Enlarge the covariance by the structure of the residuals beyond white noise.
 
-    prior: the part of `covariance` that comes from priors.
+    Args:
+        left: residuals.
+        predicted: (n, k, 2) [px].
+        covariance: (p, p) nominal, edge units.
+        prior: (p, p) part of it that comes from priors.
+        sampling_px: see `certify`.
+
+    Returns:
+        The covariance; whether the beads of a frame err together, and whether errors
+        repeat with the turn; and drifts.
     """
     reported = len(covariance)
     together = cluster_covariance(left)
@@ -556,7 +574,7 @@ def _widened(
 
 
 def _sampling_vectors(problem: FitProblem, predicted: FloatArray) -> FloatArray:
-    """Whitened unit errors that follow a bead's place in the pixel grid, (2 n k, 4 k).
+    """Compute whitened unit errors that follow a bead's place in the pixel grid, (2 n k, 4 k).
 
     An error e(x) with the pixel's period, a sin(2 pi x + theta) with theta unknown, has the
     covariance a^2 cos 2 pi (x - x'): two vectors, cosine and sine, for each bead and coordinate.

@@ -1,9 +1,10 @@
-"""Evidence of linear models of the residuals, and what averaging over them states.
+"""Evidence of linear models of the residuals, and averages over them.
 
-A model gives each column of a table a normal prior; columns of no prior are flat. Its evidence is
-the likelihood of the residuals with all columns integrated out, at the standard deviation of the
-residuals that makes them most likely (MacKay, Neural Computation 4 (1992) 415). Estimates averaged
-with those weights have the covariance of the mixture: what the models say, and how far they differ.
+A model gives each column of a table a normal prior; columns of no prior are flat. Its
+evidence is the likelihood of the residuals with all columns integrated out, at the
+standard deviation of the residuals that makes them most likely (MacKay, Neural
+Computation 4 (1992) 415). Estimates averaged with those weights have the covariance of
+the mixture: those of the models, and that of their differences.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from flexdt.twin.geometry.conventions import FloatArray
 PASSES = 3
 """Steps of the search for the residuals' standard deviation."""
 LEAST_SHARE = 1e-12
-"""Of the residuals' squares: what is less is rounding."""
+"""Least share of the residuals' squares; below it is rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +47,7 @@ class Judged:
     evidence: float
 
     def covariance(self, count: int) -> FloatArray:
-        """(count, count) of the first columns."""
+        """Return the covariance (count, count) of the first columns."""
         part = np.eye(len(self.columns))[:, :count] * self.scale[:count]
         solved, _ = lapack.dpotrs(self.factor, part)
         return np.asarray(solved[:count] * self.scale[:count, None])
@@ -56,7 +57,7 @@ class Table:
     """Rows of residuals and of all columns that a model may have."""
 
     def __init__(self, rows: FloatArray, values: FloatArray, floor: float) -> None:
-        """From rows (m, q), values (m,), and the least standard deviation of the values."""
+        """Prepare rows (m, q), values (m,), and the least standard deviation of the values."""
         self._count = len(values)
         self._gram = cross(rows, rows)
         self._push = np.einsum("mq,m->q", rows, values)
@@ -66,13 +67,13 @@ class Table:
     def judged(
         self, columns: Sequence[int], widths: FloatArray, noise: float, means: FloatArray
     ) -> Judged | None:
-        """Judge a model; None where its columns cannot be told apart.
+        """Judge a model; None if its columns are not separable.
 
         Args:
             columns: that it has.
-            widths: (c,) standard deviations of their priors; inf where there is none.
-            noise: where the search for the standard deviation of the residuals begins.
-            means: (c,) of the priors; any where there is none.
+            widths: (c,) standard deviations of their priors; inf without one.
+            noise: start of the search for the standard deviation of the residuals.
+            means: (c,) of the priors; any value without one.
         """
         at = np.asarray(columns, dtype=np.intp)
         gram = self._gram[np.ix_(at, at)]
@@ -114,14 +115,15 @@ class Table:
 
 
 def freedom_log(count: int, variance: float) -> float:
-    """Part of the evidence that the spread of `count` values has."""
+    """Return the part of the evidence from the spread of `count` values."""
     return count * math.log(variance)
 
 
 def averaged(
     models: Sequence[Judged], weights: FloatArray, count: int, at: Judged
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean (count,) of the first columns over models less that of `at`, and covariance about it.
+    """Average the first columns over models: mean (count,) less that of `at`, and
+    covariance about it.
 
     Args:
         models: judged on one table, of the same first columns.

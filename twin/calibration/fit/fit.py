@@ -1,17 +1,18 @@
-"""The fit of a geometry to bead tracks: the public entry points of the estimation, its solver, and
-what follows from its covariance.
+"""The fit of a geometry to bead tracks: the public entry points of the estimation, its
+solver, and quantities that follow from its covariance.
 
-`estimate_geometry` always returns what the data determine, with its uncertainty report.
-`fit_geometry` does the same but raises where the data do not determine what was requested.
+`estimate_geometry` always returns an estimate, with its uncertainty report.
+`fit_geometry` does the same but raises where the data do not determine the requested
+parameters.
 
 The solver is Levenberg-Marquardt. Its Huber stage finds the solution in spite of outliers;
 positions further than `trim` robust standard deviations are then left out and the rest is fitted by
 plain least squares, so that the covariance is that of least squares on clean data.
 
-What a reconstruction needs of a geometry (axis column, in-plane angle and magnification) is known
-far better than the offsets of which these quantities are functions: offsets that trade against each
-other (a detector aside and an object aside) leave the images as they are. So their sigmas need the
-whole covariance.
+The quantities that a reconstruction needs (axis column, in-plane angle and magnification)
+are known far better than the offsets of which they are functions: offsets that trade
+against each other (a detector aside and an object aside) leave the images as they are. So
+their sigmas need the full covariance.
 """
 
 from __future__ import annotations
@@ -59,10 +60,10 @@ from flexdt.twin.signatures import with_arguments_of
 RAYLEIGH_MEDIAN = 1.1774100225154747
 """Median length of a 2-vector with independent unit normal parts."""
 LEAST_PIVOT = 1e-15
-"""Of the scaled normal equations: what is less is rounding."""
+"""Least pivot of the scaled normal equations; below it is rounding."""
 LEAST_NOISE = 1e-4
-"""Exact data are weighed as if their whitened residuals had this spread: a prior then still keeps
-what the data say nothing about, and counts when the rank is judged."""
+"""Least spread of whitened residuals, assumed for exact data: priors then still fix
+directions that the data leave open, and count when the rank is judged."""
 IN_IMAGES: Final[Mapping[str, str]] = {
     "axis_column": "px",
     "axis_angle": "deg",
@@ -79,11 +80,12 @@ SLOPE_STEP: Final = 1e-4
 
 @dataclass(frozen=True)
 class Solver:
-    """How to solve.
+    """Settings of the solver.
 
     Attributes:
         huber: threshold of the Huber loss in robust standard deviations; inf switches it off.
-        trim: positions beyond this many robust standard deviations are left out; inf: none.
+        trim: positions beyond this many robust standard deviations are left out; inf: all
+            are kept.
         floor_px: the robust spread is taken to be at least this [whitened units], so that exact
             data have no outliers.
         max_iterations: of each Levenberg-Marquardt run.
@@ -131,8 +133,8 @@ def solve(
     """Minimise the robust reprojection error.
 
     Args:
-        problem: what to fit.
-        solver: how; the default is robust.
+        problem: the data and columns.
+        solver: settings; the default is robust.
         x: start of the columns; None is the problem's own.
         prior_noise: spread of the whitened residuals, with which the problem's priors are weighed.
     """
@@ -165,8 +167,9 @@ def solve(
 
 
 def _spread(norms: FloatArray, columns: int, floor: float) -> float:
-    """Robust standard deviation of whitened residuals, generous where few are left to judge by:
-    a fit swallows part of the noise, and a median of few is unreliable."""
+    """Compute the robust standard deviation of whitened residuals, larger for few degrees
+    of freedom: a fit absorbs part of the noise, and a median of few is unreliable.
+    """
     dof = 2 * len(norms) - columns
     if dof <= 0:
         return math.inf
@@ -177,7 +180,7 @@ def _spread(norms: FloatArray, columns: int, floor: float) -> float:
 def _levenberg(
     p: FitProblem, x: FloatArray, use: npt.NDArray[np.bool_], how: Solver, prior_noise: float
 ) -> tuple[FloatArray, int, float, bool]:
-    """Levenberg-Marquardt with Marquardt's diagonal from `x`.
+    """Run Levenberg-Marquardt with Marquardt's diagonal from `x`.
 
     The first step is tried almost undamped; damping appears only when a step fails. The Huber
     threshold follows the residuals: `how.huber` times their robust spread. Stops when a step is
@@ -247,8 +250,16 @@ def _levenberg(
 
 
 def _step(hess: FloatArray, grad: FloatArray, damping: float) -> FloatArray | None:
-    """The solution of the column-scaled, damped normal equations, of which `hess` is the upper
-    triangle; None where they are not positive definite."""
+    """Solve the column-scaled, damped normal equations.
+
+    Args:
+        hess: (c, c), upper triangle.
+        grad: (c,).
+        damping: added to the scaled diagonal.
+
+    Returns:
+        The step; None where the equations are not positive definite.
+    """
     diagonal = np.diag(hess)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     scaled = hess * np.outer(scale, scale)
@@ -260,7 +271,9 @@ def _step(hess: FloatArray, grad: FloatArray, damping: float) -> FloatArray | No
 
 
 def cost_at(problem: FitProblem, x: FloatArray, use: npt.NDArray[np.bool_]) -> float:
-    """Half the sum of squared whitened residuals; inf where a bead would be behind the source."""
+    """Compute half the sum of squared whitened residuals; inf where a bead would be
+    behind the source.
+    """
     try:
         norms = problem.residuals(x)[1]
     except TwinError:
@@ -273,8 +286,8 @@ class FitResult:
     """A fitted geometry.
 
     Attributes:
-        parameters: the whole geometry of the first (usually only) group, internal units, in the
-            reading `Poses.cone_vec` and corrections use.
+        parameters: the complete geometry of the first (usually only) group, internal
+            units, in the reading `Poses.cone_vec` and corrections use.
         group_parameters: the same for every group.
         beads: (k, 3) bead positions, moved if they were free [mm].
         certificate: values with uncertainties and everything else about quality.
@@ -363,17 +376,18 @@ def estimate_geometry(
 ) -> FitResult:
     """Fit offsets (true minus nominal) to measured bead positions.
 
-    Several scans go into one fit by concatenating their frames: poses link them through the motor
-    readings, `groups` says which frames belong together and `per_group` which parameters each
-    group has for itself (for example alpha, tau_x and tau_z after the phantom was remounted).
+    Several scans go into one fit by concatenating their frames: poses link them through
+    the motor readings, `groups` labels the frames that belong together and `per_group`
+    lists the parameters that each group has for itself (for example alpha, tau_x and
+    tau_z after the phantom was remounted).
 
     Args:
         tracks: (n, k, 2) pixels (column, row), nan where a bead was not seen.
         phantom: k beads: anything with `beads` and `bead_radius_mm`, or their centres (k, 3) [mm].
         geometry: nominal geometry of each of the n frames.
-        free: parameters to estimate, of `geometry.offsets.NAMES`; what has no prior either stays at
-            `start`. If source, stage and detector shifts of one direction are all free, the source
-            is fixed.
+        free: parameters to estimate, of `geometry.offsets.NAMES`; parameters without a
+            prior either stay at `start`. If source, stage and detector shifts of one
+            direction are all free, the source is fixed.
         shape: detector (rows, cols); None is the default machine's camera.
         covariances: (n, k, 2, 2) of the positions [px^2]; None is noise_px for all.
         noise_px: standard deviation of a coordinate. Only ratios matter for the values; sigmas
@@ -382,19 +396,20 @@ def estimate_geometry(
         per_group: names among `free` with a value in each group.
         free_beads: estimate bead positions too (bundle adjustment), with
         bead_tolerance_mm: the standard deviation of their prior; None is the phantom's own.
-        start: where to start, and the value of what is not free.
+        start: start values, and the values of parameters that are not free.
         reading: of eq. 5.4.
-        centre: what the positions are: projected centres or outline centres; or the bias factor of
-            each position, (n, k), such as 0.8 for a centroid weighted by chord length.
+        centre: kind of the positions: projected centres or outline centres; or the bias
+            factor of each position, (n, k), such as 0.8 for a centroid weighted by chord
+            length.
         sampling_px: see `certify`; 0 for points, about 0.001 for centroids in images.
         solver: None is Huber, trimming, then least squares.
-        priors: parameter -> standard deviation of what is known of it beforehand [mm, deg, 1]; 0
-            is exactly known. A parameter that is not in `free` is estimated along with them. None:
-            everything that is not free is exactly where `start` has it (`fit.priors` has widths
-            for scanners).
+        priors: parameter -> standard deviation of its prior [mm, deg, 1]; 0 is exactly
+            known. A parameter that is not in `free` is estimated along with them. None:
+            all parameters that are not free are exactly at `start` (`fit.priors` has
+            widths for scanners).
         prior_centre: the offsets those priors are centred on; None is the start of the first group.
         bound: sigma [mm, deg] beyond which a direction counts as not determined.
-        panel: terms of a distortion of the panel, estimated too; None: it has none.
+        panel: terms of a distortion of the panel, estimated too; None: no distortion.
         strain: standard deviations of the phantom's stretches and shears [1], estimated too.
         arc: the object may turn while a frame is exposed, by an unknown share of a step.
 
@@ -402,8 +417,8 @@ def estimate_geometry(
         The fit with its certificate, also where not everything is determined.
 
     Raises:
-        TwinError: shapes do not match, nothing was seen, a width is no length, or free beads
-            without a tolerance.
+        TwinError: shapes do not match, no bead was seen, a width is no length, or free
+            beads without a tolerance.
         UnknownNameError: a name that is no parameter.
     """
     model = bead_model(phantom)
@@ -453,7 +468,7 @@ def fit_geometry(*args: Any, **options: Any) -> FitResult:
         NotIdentifiableError: names the directions that are not determined, with advice.
         TwinError, UnknownNameError: as `estimate_geometry`.
 
-    Example: the object stands 0.5 mm further to the right than the motors say.
+    Example: the object is 0.5 mm further to the right than the motors report.
 
     >>> import numpy as np
     >>> from flexdt.phantoms import bead_phantom
@@ -493,7 +508,7 @@ def require_identifiable(result: FitResult) -> FitResult:
 
 
 def with_start(result: FitResult, start: Offsets, iterations: int) -> FitResult:
-    """The result of a chain of fits, counted from the start of the first.
+    """Return the result of a chain of fits, counted from the start of the first.
 
     Args:
         result: the last fit of the chain.
@@ -508,8 +523,12 @@ def with_start(result: FitResult, start: Offsets, iterations: int) -> FitResult:
 
 
 def _solved(problem: FitProblem, solver: Solver | None) -> tuple[Solution, float]:
-    """The solution, and the spread of the whitened residuals its priors were weighed with, which is
-    that of the previous pass."""
+    """Solve a problem, and weight its priors by the spread of the residuals.
+
+    Returns:
+        The solution, and the spread of the whitened residuals by which its priors were
+        weighted, from the previous pass.
+    """
     noise, x = 1.0, problem.start
     for _ in range(4):
         solution = solve(problem, solver, x=x, prior_noise=noise)
@@ -524,7 +543,7 @@ def _solved(problem: FitProblem, solver: Solver | None) -> tuple[Solution, float
 
 
 def image_quantities(fit: FitResult) -> tuple[dict[str, Estimate], ...]:
-    """The quantities IN_IMAGES describes, in the first frame of each group of frames.
+    """Compute the quantities of IN_IMAGES, in the first frame of each group of frames.
 
     Args:
         fit: whose estimates are all determined.
@@ -549,7 +568,7 @@ def image_quantities(fit: FitResult) -> tuple[dict[str, Estimate], ...]:
 
 
 def image_slopes(problem: FitProblem, x: FloatArray, group: int) -> tuple[FloatArray, FloatArray]:
-    """The quantities IN_IMAGES describes, and how they follow the parameters.
+    """Compute the quantities of IN_IMAGES, and their derivatives by the parameters.
 
     Args:
         problem: the data.
@@ -577,8 +596,13 @@ def _axis_at(problem: FitProblem, x: FloatArray, group: int) -> FloatArray:
 
 
 def axis_in_image(pose: Poses, offsets: Offsets, middle: FloatArray) -> FloatArray:
-    """The values of IN_IMAGES, in its order, of one pose; `middle` is the detector's centre
-    (column, row) [px]."""
+    """Compute the values of IN_IMAGES, in its order, of one pose.
+
+    Args:
+        pose: one frame.
+        offsets: of the geometry.
+        middle: the detector's centre (column, row) [px].
+    """
     cone = pose.cone_vec(offsets)
     # In the object's frame the axis is vertical and passes through tau (`Poses.cone_vec`).
     foot = np.array([offsets.tau_x, offsets.tau_z, 0.0])
@@ -592,7 +616,8 @@ def axis_in_image(pose: Poses, offsets: Offsets, middle: FloatArray) -> FloatArr
 
 
 def covariance_by_step(fit: FitResult, count: int) -> list[tuple[int, FloatArray | None]]:
-    """What the first frames of a fit would know by themselves, with the noise of all.
+    """Predict the covariance that the first frames of a fit alone would have, with the
+    noise of all.
 
     Args:
         fit: of n frames.

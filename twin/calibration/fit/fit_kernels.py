@@ -1,19 +1,20 @@
 """Compiled kernels of the fit: residuals, exact derivatives, normal equations.
 
-For any subset of the seventeen parameters, and for the beads themselves, they compute what
-`Poses.cone_vec(parameters).project_points(beads)` computes. That makes this the second place where
-offsets meet geometry: tests/twin/calibration/test_kernel_binding.py compares values and
-derivatives of all seventeen with `Poses.cone_vec`, and fails if any one sign here is flipped.
-`fit.problem` builds and checks the arguments.
+For any subset of the seventeen parameters, and for the beads themselves, they compute the
+same as `Poses.cone_vec(parameters).project_points(beads)`. That makes this the second
+place where offsets meet geometry: tests/twin/calibration/test_kernel_binding.py compares
+values and derivatives of all seventeen with `Poses.cone_vec`, and fails if any one sign
+here is flipped. `fit.problem` builds and checks the arguments.
 
-Forward model of frame n and bead b, in the world frame: q = c + T R (b + m - tau),
-c = O + dO + pivot * tau (pivot 1: eq. 5.4 as printed; 0: R(b - tau) + O), R clockwise from above by
-alpha + angle_scale * phi, T the axis tilt, m where a stage on the turntable stands. With w = q - S,
-g = D - S and the pixel steps u, v the bead's centre is projected to column w.P / w.n and row
-w.Q / w.n from the detector's centre, P = v x g, Q = g x u, n = u x v: Cramer's rule, valid for any
-u, v. The spot of a ball is displaced from the projection of its centre:
-spot = a + bias * (r / depth)^2 (a - foot), bias 1 for the outline's centre, 0.8 for the
-chord-weighted centroid, 0 for points (calibration.md, "Images").
+Forward model of frame n and bead b, in the world frame: q = c + T R (b + m - tau), c = O
++ dO + pivot * tau (pivot 1: eq. 5.4 as printed; 0: R(b - tau) + O), R clockwise from
+above by alpha + angle_scale * phi, T the axis tilt, m the place of a stage on the
+turntable. With w = q - S, g = D - S and the pixel steps u, v the bead's centre is
+projected to column w.P / w.n and row w.Q / w.n from the detector's centre, P = v x g, Q =
+g x u, n = u x v: Cramer's rule, valid for any u, v. The spot of a ball is displaced from
+the projection of its centre: spot = a + bias * (r / depth)^2 (a - foot), bias 1 for the
+outline's centre, 0.8 for the chord-weighted centroid, 0 for points (calibration.md,
+"Images").
 
 All of a frame is in a matrix from beads to columns, rows and depths. Its derivatives are imaginary
 parts: where a parameter has the imaginary part h, a smooth real function has h times its slope,
@@ -40,7 +41,7 @@ ROLL, PITCH, YAW, TILT_X, TILT_Z, ANGLE_SCALE = range(11, PARAMETERS)
 # First columns of a row of `geometry`.
 SOURCE, AXIS, DETECTOR, U, V, ANGLE, MOUNT = 0, 3, 6, 9, 12, 15, 16
 STEP = 1e-30
-"""Imaginary part of a parameter whose derivative is wanted: its square is nothing beside 1."""
+"""Imaginary part of a parameter for its derivative: its square is negligible."""
 
 
 @linked(forceinline=True)
@@ -55,7 +56,7 @@ def _cross(a, b):  # type: ignore[no-untyped-def]
 
 @linked(forceinline=True)
 def _wave(angle):  # type: ignore[no-untyped-def]
-    """Cosine and sine of an angle with a small imaginary part."""
+    """Return cosine and sine of an angle with a small imaginary part."""
     c, s = math.cos(angle.real), math.sin(angle.real)
     return complex(c, -s * angle.imag), complex(s, c * angle.imag)
 
@@ -68,7 +69,7 @@ def _unit(a):  # type: ignore[no-untyped-def]
 
 @linked
 def _turned(vector, axis, angle):  # type: ignore[no-untyped-def]
-    """`vector` turned about the direction `axis` by `angle` (Rodrigues)."""
+    """Turn `vector` about the direction `axis` by `angle` (Rodrigues)."""
     c, s = _wave(angle)
     k = _unit(axis)
     t = (1.0 - c) * _dot(k, vector)
@@ -82,10 +83,16 @@ def _turned(vector, axis, angle):  # type: ignore[no-untyped-def]
 
 @linked
 def frame_matrix(p, geo, pivot, matrix, foot):  # type: ignore[no-untyped-def]
-    """The matrix (3, 4) from a bead (x, y, z, 1) to column, row and 1, times its depth [mm], and
-    column, row and 1 of the perpendicular's foot; pixels from the detector's centre.
+    """Compute the projection matrix of a frame.
 
-    p: (17,) complex parameters; geo: (18,) complex, see `Data`.
+    Args:
+        p: (17,) complex parameters.
+        geo: (18,) complex, see `Data`.
+        pivot: 1.0 or 0.0, see the module.
+        matrix: (3, 4) from a bead (x, y, z, 1) to column, row and 1, times its depth
+            [mm]; written.
+        foot: (3,) column, row and 1 of the perpendicular's foot; written. Pixels are from
+            the detector's centre.
     """
     s = geo[SOURCE] + p[DS_X], geo[SOURCE + 1], geo[SOURCE + 2] + p[DS_Y]
     g = (
@@ -124,7 +131,7 @@ def frame_matrix(p, geo, pivot, matrix, foot):  # type: ignore[no-untyped-def]
 
 
 class Data(NamedTuple):
-    """What a fit is made from, C-contiguous; n frames, k beads.
+    """The data of a fit, C-contiguous; n frames, k beads.
 
     Attributes:
         geometry: (n, 18) nominal source, axis, detector, u, v [mm], angle [rad] and the mount's x
@@ -135,7 +142,7 @@ class Data(NamedTuple):
         bias: (n, k) factor of the sphere-centre bias.
         measured: (n, k, 2) pixels from the detector's centre.
         whiten: (n, k, 3): rows (w0, w1; 0, w2) that turn residuals into unit variance.
-        active: indices of the parameters whose derivatives are wanted.
+        active: indices of the parameters to differentiate by.
         colmap: (groups, 17) column of each parameter or -1.
         bead_col: first column of the beads' coordinates or -1.
         terms: (n, k, 2, t) shifts by a coefficient of 1 of each term of the panel's distortion,
@@ -159,7 +166,7 @@ class Data(NamedTuple):
 def evaluate(  # type: ignore[no-untyped-def]
     data, params, beads, panel, use, huber, want, predicted, norms, jac, hess, grad
 ):
-    """One pass over all observations.
+    """Evaluate all observations in one pass.
 
     Args:
         data: see `Data`.

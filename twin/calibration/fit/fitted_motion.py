@@ -1,14 +1,15 @@
 """Motion during a scan: parameters that differ from frame to frame, found from bead tracks.
 
-A parameter that moves is its value in the fit plus a deviation in each frame, whose mean over the
-scan is zero. Deviations are normal, smaller where they bend more, by a width and a smoothness that
-maximise the restricted likelihood of the tracks (REML; Patterson and Thompson, Biometrika 58 (1971)
-545). So a screw, a drift and a wobble come out smooth, jitter comes out frame by frame, and what
-the tracks do not show stays zero. Nothing is said of the slope at either end: deviations that are
-taken to be level there make a drift, which is not, look like what turns once with the table.
+A parameter that moves is its value in the fit plus a deviation in each frame, whose mean
+over the scan is zero. Deviations are normal, smaller where they bend more, by a width and
+a smoothness that maximise the restricted likelihood of the tracks (REML; Patterson and
+Thompson, Biometrika 58 (1971) 545). So a screw, a drift and a wobble come out smooth,
+jitter comes out frame by frame, and motion that the tracks do not show stays zero. The
+slope at either end is free: deviations assumed level there make a drift, which is not,
+look like a motion that turns once with the table.
 
-The estimate is linear in small deviations. The caller puts them into the poses, fits again, and
-estimates what remains, until they stay.
+The estimate is linear in small deviations. The caller puts them into the poses, fits
+again, and estimates the remainder, until they stay.
 """
 
 from __future__ import annotations
@@ -34,15 +35,15 @@ from flexdt.twin.geometry.motion import Motion, require_movable
 from flexdt.twin.geometry.offsets import NAMES
 
 WIDTHS: Final = tuple(10.0 ** (0.5 * k) for k in range(-2, 9))
-"""Widths that are tried, in units of what one frame can tell."""
+"""Trial widths, in units of the sigma from one frame."""
 WAVES: Final = (1.0, 4.0, 16.0, 64.0, math.inf)
-"""Smoothness that is tried: half waves in a scan above which amplitudes fall; inf: none does."""
+"""Trial smoothness: half waves in a scan above which amplitudes fall; inf: no fall."""
 COLUMNS: Final = 512
-"""Columns of the covariance worked on at a time."""
+"""Number of covariance columns processed at a time."""
 DOUBT: Final = 2.0
-"""Width and smoothness are not rejected that lose no more log likelihood."""
+"""Loss of log likelihood up to which width and smoothness are not rejected."""
 ONCE: Final = 2
-"""Half waves of the cosine that goes once through a scan."""
+"""Half waves of the cosine with one period a scan."""
 MOST_PASSES: Final = 6
 BESIDE_BEAM: Final = 0.01
 """Standard deviation of the slope of a motion along the beam against it: 6 mm in 600; assumed."""
@@ -50,8 +51,8 @@ EVIDENCE: Final = 6.0
 """Gain in log likelihood from which a parameter counts as moving: white noise has it in less than
 one of a thousand fits (55 pairs of width and smoothness are tried)."""
 _Answer = tuple[FloatArray, FloatArray, FloatArray, float]
-"""Deviations (n, p) with sigmas, what they add to the covariance of the fit's columns, and the
-factor by which they take up its degrees of freedom."""
+"""Deviations (n, p) with sigmas, the covariance that they add to the fit's columns, and
+the factor by which they take up its degrees of freedom."""
 _Choice = tuple[tuple[float, float] | None, ...]
 """Width and smoothness of each parameter; None: it does not move."""
 
@@ -62,7 +63,7 @@ class MotionFit:
 
     Attributes:
         motions: of each scan (group of frames).
-        covariance: (p, p) what not knowing the motion adds to the covariance of the fit's
+        covariance: (p, p) covariance that the unknown motion adds to the fit's
             parameters, edge units.
         choice: width and smoothness of each parameter's deviations; None: it does not move.
     """
@@ -72,28 +73,28 @@ class MotionFit:
     choice: _Choice
 
     def near(self, other: MotionFit) -> bool:
-        """Whether the deviations differ by less than a hundredth of a sigma."""
+        """Check whether the deviations differ by less than a hundredth of a sigma."""
         return all(a.near(b) for a, b in zip(self.motions, other.motions, strict=True))
 
 
 def estimate_motion(
     fit: FitResult, names: Sequence[str], known: MotionFit | None = None, *, search: bool = True
 ) -> MotionFit:
-    """Find the motion in the tracks of a fit.
+    """Estimate the motion in the tracks of a fit.
 
     Args:
         fit: parameters that are the same in all frames, with poses that hold the motion `known`.
         names: parameters that may move, of `geometry.motion.MOVABLE`.
-        known: motion that the fit's poses hold; None: none.
+        known: motion that the fit's poses hold; None: no motion.
         search: for the most likely width and smoothness; else those of `known` are taken.
 
     Returns:
-        The whole motion of each scan, `known` included. A parameter that the scans share has
-        deviations from its mean over all of their frames.
+        The total motion of each scan, `known` included. A parameter that the scans share
+        has deviations from its mean over all of their frames.
 
     Raises:
         UnknownNameError: a name that cannot move.
-        TwinError: fewer than three frames in a scan, or tracks that tell nothing.
+        TwinError: fewer than three frames in a scan, or tracks without information.
     """
     require_movable(names)
     problem, x = fit.problem, fit.solution.x
@@ -152,7 +153,7 @@ def follow_motion(
     """Estimate motion and the other parameters by turns until the motion stays.
 
     Args:
-        fit: to poses that hold the motion `known`; None: none.
+        fit: to poses that hold the motion `known`; None: no motion.
         names: parameters that may move.
         refit: the fit to poses that hold another motion.
 
@@ -169,7 +170,7 @@ def follow_motion(
 
 
 def aware(fit: FitResult, held: MotionFit) -> FitResult:
-    """The fit with sigmas that allow for what the motion in its poses may be off."""
+    """Add the uncertainty of the motion in the poses to the sigmas of a fit."""
     if not fit.identifiable:
         return fit
     names = held.motions[0].names
@@ -179,10 +180,15 @@ def aware(fit: FitResult, held: MotionFit) -> FitResult:
 
 
 def _along_the_beam(fit: FitResult, held: MotionFit) -> FloatArray:
-    """Covariance (p, p), edge units, that a motion along the beam adds as its way is not exactly
-    the beam's: a phantom that grows moves, as seen, away from where it hangs.
+    """Compute the covariance (p, p), edge units, that a motion along the beam adds by its
+    direction.
 
-    The slopes of the way are two more columns with a prior; what they change is taken as an error.
+    A phantom that grows moves, as seen, away from its mount. The slopes of the direction
+    are two more columns with a prior; the changes that they make are taken as errors.
+
+    Args:
+        fit: to the poses with the motion.
+        held: the motion in them.
     """
     problem, x = fit.problem, fit.solution.x
     count = problem.layout.parameter_count
@@ -213,8 +219,10 @@ def _along_the_beam(fit: FitResult, held: MotionFit) -> FloatArray:
 
 
 def _used(problem: FitProblem, fit: FitResult) -> npt.NDArray[np.bool_]:
-    """The positions the fit used, and all of a frame whose positions it mostly left out: single
-    beads are outliers, all of them together are motion."""
+    """Mark the used positions, and all of a frame whose positions were mostly left out.
+
+    Single beads left out are outliers, all of them together are motion.
+    """
     use = fit.solution.use.copy()
     lost = (problem.seen & ~use).sum(axis=1) > 0.5 * problem.seen.sum(axis=1)
     use[lost] = problem.seen[lost]
@@ -224,7 +232,15 @@ def _used(problem: FitProblem, fit: FitResult) -> npt.NDArray[np.bool_]:
 def derivative(
     problem: FitProblem, fit: FitResult, name: str, use: npt.NDArray[np.bool_]
 ) -> FloatArray:
-    """(2 n k,) whitened change of the positions with one frame's parameter, free or not."""
+    """Compute the whitened change (2 n k,) of the positions with one frame's parameter,
+    free or not.
+
+    Args:
+        problem: of the fit.
+        fit: gives the column values.
+        name: of the parameter.
+        use: (n, k) positions that count.
+    """
     params, beads = problem.spread(fit.solution.x)
     groups = len(params)
     alone = layout((name,), groups, (name,), len(beads), False)
@@ -249,7 +265,7 @@ class _Mixed:
         total: sum of squares of the residuals, priors included.
         freedom: number of rows and priors less g.
         sizes: frames of each scan.
-        column: (n, p) column of the fit that a deviation is one from; -1: of none.
+        column: (n, p) column of the fit to which a deviation belongs; -1: to no column.
     """
 
     def __init__(
@@ -263,8 +279,18 @@ class _Mixed:
         weight: FloatArray,
         off: FloatArray,
     ) -> None:
-        """From rows (m, g), residuals (m,), derivatives (m, p) by each row's frame's parameters,
-        and priors of weight (g,) whose means lie (g,) off."""
+        """Sum up the normal equations.
+
+        Args:
+            rows: (m, g).
+            residual: (m,).
+            motion: (m, p) derivatives by the parameters of each row's frame.
+            frame: (m,) of each row.
+            sizes: frames of each scan.
+            column: (n, p), see the class.
+            weight: (g,) of the priors.
+            off: (g,) distance of their means.
+        """
         n, p, g = sum(sizes), motion.shape[1], rows.shape[1]
         self.sizes, self.column = sizes, column
         self.scale = np.sqrt(np.einsum("mg,mg->g", rows, rows) + weight)
@@ -284,8 +310,10 @@ class _Mixed:
         self.freedom = max(len(residual) + int((weight > 0).sum()) - g, 1)
 
     def spectrum(self, i: int, pick: tuple[float, float]) -> list[FloatArray]:
-        """Variance of the amplitude of each scan's cosines, from none to the most half waves, for
-        deviations that are level at the ends; the first is that of the width."""
+        """Compute the variance of the amplitude of each scan's cosines, by their number
+        of half waves, for deviations that are level at the ends; the first is that of the
+        width.
+        """
         width, waves = pick
         one_frame = 1.0 / max(float(self.pairs[:, i, i].mean()), 1e-300)
         out = []
@@ -296,7 +324,9 @@ class _Mixed:
         return out
 
     def _diagonals(self, i: int, pick: tuple[float, float]) -> FloatArray:
-        """The three lower diagonals (3, n) of the prior precision of a parameter's deviations."""
+        """Compute the three lower diagonals (3, n) of the prior precision of a
+        parameter's deviations.
+        """
         parts = []
         for size, variance in zip(self.sizes, self.spectrum(i, pick), strict=True):
             inner = np.ones(size - 2)  # frames with a second difference [1, -2, 1]
@@ -309,7 +339,7 @@ class _Mixed:
         return np.concatenate(parts, axis=1)
 
     def _factor(self, moving: Sequence[int], choice: _Choice) -> FloatArray:
-        """Banded Cholesky factor of the deviations' normal equations, frame by frame."""
+        """Factorise the deviations' normal equations, frame by frame (banded Cholesky)."""
         n, p = len(self.pull), len(moving)
         band = np.zeros((2 * p + 1, n, p))
         for a, i in enumerate(moving):
@@ -323,6 +353,7 @@ class _Mixed:
         )
 
     def _eliminated(self, choice: _Choice) -> _Eliminated:
+        """Eliminate the deviations of a choice from the normal equations."""
         moving = [i for i, pick in enumerate(choice) if pick is not None]
         if not moving:
             empty = np.zeros((0, len(self.scale)))
@@ -340,7 +371,7 @@ class _Mixed:
         )  # fmt: skip
 
     def likelihood(self, choice: _Choice) -> float:
-        """Logarithm of the restricted likelihood, but for a constant."""
+        """Compute the logarithm of the restricted likelihood, up to a constant."""
         part = self._eliminated(choice)
         lower = linalg.cholesky(part.left, lower=True, check_finite=False)
         found = linalg.solve_triangular(lower, part.push, lower=True)
@@ -353,7 +384,14 @@ class _Mixed:
         return float(-0.5 * (volume + self.freedom * math.log(rest)))
 
     def solved(self, choice: _Choice) -> _Answer:
-        """The deviations of a choice."""
+        """Solve for the deviations of a choice.
+
+        Args:
+            choice: width and smoothness of each parameter.
+
+        Returns:
+            See `_Answer`.
+        """
         part = self._eliminated(choice)
         inverse = linalg.inv(part.left)
         fixed = inverse @ part.push
@@ -406,8 +444,10 @@ class _Mixed:
 
 @dataclass(frozen=True, eq=False)
 class _Eliminated:
-    """Normal equations of the fit's columns once the deviations are eliminated: `left` (g, g) and
-    `push` (g,), with the banded factor, what was eliminated, and the sum of squares explained."""
+    """Normal equations of the fit's columns once the deviations are eliminated: `left`
+    (g, g) and `push` (g,), with the banded factor, the eliminated parameters, and the sum
+    of squares explained.
+    """
 
     moving: tuple[int, ...]
     band: FloatArray
@@ -419,15 +459,17 @@ class _Eliminated:
 
 
 def _stiffness(size: int, waves: float) -> float:
-    """Eigenvalue of the second differences at which amplitudes fall."""
+    """Return the eigenvalue of the second differences at which amplitudes fall."""
     return (2.0 * math.sin(0.5 * math.pi * waves / size)) ** 2 if waves < size else math.inf
 
 
 def _most_likely(model: _Mixed) -> tuple[_Choice, list[float]]:
-    """Width and smoothness of each parameter, by turns, and the evidence that it moves at all.
+    """Choose width and smoothness of each parameter, by turns, and the evidence that it
+    moves at all.
 
-    One scan says little of a width: of what it does not reject the choice is the one that leaves
-    most room to what turns once with the table, which other parameters do as well.
+    One scan hardly determines a width: among the values that it does not reject, the
+    choice leaves most room to motions that turn once with the table, which other
+    parameters do too.
     """
     p = model.pairs.shape[1]
     middle, starts = (WIDTHS[3], WAVES[2]), ((3, 1), (3, len(WAVES) - 1))

@@ -1,7 +1,7 @@
-"""What a planned scan can determine, before it is made, and what to change if that is too little.
+"""Forecast of the parameters that a planned scan determines, and changes to improve it.
 
-The prediction is the Cramer-Rao bound of the reprojection residuals at the planned geometry. The
-suggestions are planned scans as well and are evaluated in the same way.
+The prediction is the Cramer-Rao bound of the reprojection residuals at the planned
+geometry. The suggestions are planned scans too and are evaluated in the same way.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Suggestion:
     """A change to the plan and the uncertainty it would bring.
 
     Attributes:
-        change: what to do.
+        change: the change, in words.
         worst: largest sigma in units of its tolerance (0.2 mm, 0.2 deg) after the change.
         gain: by what factor the worst one shrinks.
         sigmas: predicted sigma of every parameter, edge units.
@@ -54,15 +54,16 @@ class Suggestion:
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What a planned scan determines.
+    """The parameters that a planned scan determines.
 
     Attributes:
         sigmas: column -> predicted standard deviation, edge units; inf where not determined.
-        image_sigmas: the same of what a reconstruction feels: IN_IMAGES of `fit.fit`.
+        image_sigmas: the same of the quantities that a reconstruction needs: IN_IMAGES of
+            `fit.fit`.
         covariance: (p, p) edge units.
         rank, condition: of the column-scaled Jacobian.
         null, weak: directions not determined, or badly.
-        visible: (n, k) beads wholly in view.
+        visible: (n, k) beads entirely in view.
         suggestions: changes that help, best first; empty if nothing is weak.
     """
 
@@ -78,7 +79,7 @@ class Prediction:
 
     @property
     def identifiable(self) -> bool:
-        """Every asked parameter is determined."""
+        """Whether every requested parameter is determined."""
         return not self.null
 
     @property
@@ -99,20 +100,21 @@ def identifiability(
     priors: Given | None = None,
     bound: float = BOUND,
 ) -> Prediction:
-    """Predict the uncertainty of a calibration, and what changes to the plan would make of it.
+    """Predict the uncertainty of a calibration, and that of changed plans.
 
     Args:
         phantom: the beads.
         geometry: nominal geometry of each planned frame.
         noise_px: standard deviation of a detected coordinate.
         free: parameters to be estimated.
-        shape: detector (rows, cols); None is the default machine's camera. Beads that would not
-            lie wholly on it do not count.
+        shape: detector (rows, cols); None is the default machine's camera. Beads that
+            would not be entirely on it do not count.
         at: the geometry to predict at.
-        bead_tolerance_mm: > 0: bead positions are unknowns with this prior; 0: they are exact;
-            None: the phantom as a whole may be strained, as `flexdt calibrate` assumes.
-        priors: what is known of other offsets [mm, deg, 1], in place of what `flexdt calibrate`
-            assumes of a scanner that states nothing; 0 is exactly, "none" is all exactly.
+        bead_tolerance_mm: > 0: bead positions are unknowns with this prior; 0: they are
+            exact; None: the phantom may be strained, as `flexdt calibrate` assumes.
+        priors: standard deviations of other offsets [mm, deg, 1], in place of those that
+            `flexdt calibrate` assumes for a scanner without its own; 0 is exactly, "none"
+            is all exactly.
         bound: sigma [mm, deg] beyond which a direction counts as not determined.
 
     Returns:
@@ -182,13 +184,13 @@ def identifiability(
 
 @dataclass(frozen=True, eq=False)
 class Forecast:
-    """What the data of a problem would tell, with its priors.
+    """The forecast of a problem's data, with its priors.
 
     Attributes:
-        sigmas: of what was asked for -> standard deviation, edge units; inf: not determined.
+        sigmas: requested column -> standard deviation, edge units; inf: not determined.
         image_sigmas: of IN_IMAGES.
-        covariance: (p, p) of what was asked for, edge units.
-        spectrum: rank, condition, null and weak directions of what was asked for.
+        covariance: (p, p) of the requested columns, edge units.
+        spectrum: rank, condition, null and weak directions of the requested columns.
     """
 
     sigmas: dict[str, float]
@@ -232,7 +234,7 @@ def forecast(problem: FitProblem, bound: float = BOUND) -> Forecast:
 def visible_beads(
     model: BeadModel, poses: Poses, shape: FloatArray, at: Offsets = NOMINAL
 ) -> npt.NDArray[np.bool_]:
-    """Which beads lie wholly on the detector, (n, k).
+    """Mark beads that are entirely on the detector, (n, k).
 
     Args:
         model: the beads.
@@ -253,7 +255,16 @@ def _worst(sigmas: dict[str, float]) -> float:
 
 
 def _changes(model: BeadModel, poses: Poses, sizes: FloatArray) -> dict[str, _Plan]:
-    """Changes worth trying: what to do -> the plan it gives."""
+    """List changes worth trying.
+
+    Args:
+        model: the beads.
+        poses: the planned frames.
+        sizes: (n, 2) detector (rows, cols).
+
+    Returns:
+        Words -> the changed plan.
+    """
 
     def with_more(axis: float = 0.0, beam: float = 0.0, angle: float = 0.0) -> _Plan:
         aside = poses.axis + np.array([axis, beam, 0.0])

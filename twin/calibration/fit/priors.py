@@ -1,10 +1,10 @@
-"""What is known of a scanner before a scan: a standard deviation for each offset.
+"""Priors of a scanner before a scan: a standard deviation for each offset.
 
-An offset that is not estimated is not known exactly. Its prior enters the estimate and every sigma
-(`docs/calibration.md`, "Priors"). The widths here are for a scanner of which nothing better is
-known; machine files and profiles have their own in a table `priors`.
+An offset that is not estimated is not known exactly. Its prior enters the estimate and
+every sigma (`docs/calibration.md`, "Priors"). The widths here are for a scanner without
+better ones; machine files and profiles have their own in a table `priors`.
 
-`known` is the one model: calibrations, forecasts, designs of phantoms and batches ask it.
+`known` is the one model: calibrations, forecasts, designs of phantoms and batches use it.
 """
 
 from __future__ import annotations
@@ -25,21 +25,22 @@ ASSUMED: Final[Mapping[str, float]] = {
     "dD_x": 2.0, "dD_y": 2.0, "dD_z": 1.0, "det_roll": 0.3, "det_pitch": 0.3, "det_yaw": 0.3,
     "axis_tilt_x": 0.1, "axis_tilt_z": 0.1,
 }  # fmt: skip
-"""Widths [mm, deg] for a scanner that states none of its own, assumed. Left out, so exactly known,
-are dS_x and dS_y (the source is the origin of the frame) and angle_scale (a turn of the stage
-closes on itself; wrong steps are looked for by themselves)."""
+"""Assumed: widths [mm, deg] for a scanner that states none of its own. Left out, so
+exactly known, are dS_x and dS_y (the source is the origin of the frame) and angle_scale
+(a turn of the stage closes on itself; wrong steps are found separately)."""
 FIXED: Final[Mapping[str, float]] = dict.fromkeys(SIX, 0.3)
-"""The same for what the operator chooses, where it is not to be estimated: read from motors and a
-mount, it is not exact either."""
+"""The same for the operator's choices, where they are not estimated: read from motors and
+a mount, they are not exact either."""
 
 STRAIN: Final = 1e-3
-"""Standard deviation of the scale, the stretches and the shears of a phantom that states no
-tolerance; assumed: printed plastic shrinks by that and more."""
+"""Assumed: standard deviation of the scale, the stretches and the shears of a phantom
+that states no tolerance; printed plastic shrinks by that and more."""
 NOISE_PX: Final = 0.1
-"""Standard deviation of a detected coordinate in forecasts, assumed: images of a good exposure tell
-it twenty times better, which priors hide in the offsets and which shows in the image."""
+"""Assumed: standard deviation of a detected coordinate in forecasts [px]. Images of a
+good exposure determine it twenty times better, which priors hide in the offsets and which
+shows in the image."""
 Given = Mapping[str, float] | Literal["none"]
-"""Widths that a user states in place of others [mm, deg, 1]; none: all is exactly known."""
+"""Widths that a user states in place of others [mm, deg, 1]; "none": all is exactly known."""
 
 
 def known(
@@ -47,11 +48,11 @@ def known(
     given: Given | None = None,
     scanners: Iterable[Mapping[str, float]] = (ASSUMED,),
 ) -> dict[str, float]:
-    """Give what is known of every offset before its images are seen: standard deviations.
+    """Return standard deviations of every offset before its images are seen.
 
     Args:
-        free: parameters that are estimated; only a user's own statement is a prior of these.
-        given: what a user states; None: nothing.
+        free: parameters that are estimated; only a user's own width is a prior of these.
+        given: widths that a user states; None: no widths.
         scanners: widths of the scanners, of which the widest counts.
 
     Returns:
@@ -77,17 +78,17 @@ def known_strain(
     given: Given | None = None,
     bead_tolerance_mm: float | None = None,
 ) -> Strain:
-    """Give what is known of the phantom's shape as a whole: standard deviations [1].
+    """Return standard deviations [1] of the phantom's stretches and shears.
 
-    It is 0 where beads are exactly where the phantom says (`bead_tolerance_mm` 0, or every offset
-    of the scanner stated as exact), or are unknowns themselves; less than STRAIN where the
-    phantom's own tolerance is.
+    They are 0 where beads are exactly at their stated places (`bead_tolerance_mm` 0, or
+    every offset of the scanner stated as exact), or are unknowns themselves; less than
+    STRAIN where the phantom's own tolerance is.
 
     Args:
         model: the phantom's beads.
         free: parameters that are estimated.
-        given: what a user states of the scanner; None: nothing.
-        bead_tolerance_mm: what a user states of the beads; None: nothing.
+        given: widths that a user states of the scanner; None: no widths.
+        bead_tolerance_mm: of the beads, stated by a user; None: not stated.
 
     Returns:
         Of stretches, and of shears.
@@ -105,14 +106,14 @@ def known_strain(
 
 
 def exact(free: Container[str] = SIX) -> dict[str, float]:
-    """Priors that say: everything that is not in `free` is exactly where it is said to be."""
+    """Return priors by which all parameters that are not in `free` are exactly known."""
     return {name: 0.0 for name in (*SIX, *ASSUMED) if name not in free}
 
 
 def prior_widths(
     machine: Machine | None = None, profile: Profile | None = None
 ) -> dict[str, float]:
-    """Standard deviation of each offset of a scanner [mm, deg, 1].
+    """Return the standard deviation of each offset of a scanner [mm, deg, 1].
 
     It is the profile's where that states one, else the machine's, else the assumed one.
 

@@ -34,26 +34,27 @@ EIGHT = (*SIX, "dD_x", "dD_y")
 """The thesis's extended vector, eq. 5.19."""
 
 STRAINS = ("scale", "xx", "yy", "zz", "xy", "yx", "xz", "zx", "yz", "zy")
-"""Growth of the whole, and displacements of beads along the first axis that grow with the second
-coordinate."""
+"""Growth of the phantom, and displacements of beads along the first axis proportional to
+the second coordinate."""
 STRETCHES = 4
-"""The first of them; the others are shears."""
+"""Number of stretches at the start of STRAINS; the others are shears."""
 Strain = tuple[float, float]
-"""Standard deviations of stretches and of shears [1]; 0: there are none."""
+"""Standard deviations of stretches and of shears [1]; 0: without them."""
 UNSTRAINED: Strain = (0.0, 0.0)
 LEAST_STRAIN = 1e-7
-"""Width of stretches or shears that are not there beside the others."""
+"""Width of absent stretches or shears next to present ones."""
 ARC_PRIOR = 0.5
 """Standard deviation of the squared share of a step that an exposure lasts; it is 0 to 1."""
 ARC_ANGLE_RAD = 0.02
 """Of the differences that give the curvature of the beads' paths."""
 
 GAUGES = (("dS_x", "dO_x", "dD_x"), ("dS_y", "dO_y", "dD_y"))
-"""Shifting all three of a row together changes no image: the first is fixed when all are free."""
+"""Parameters whose common shift changes no image: the first is fixed when all three are
+free."""
 
 
 class Reading(enum.Enum):
-    """The two readings of thesis eq. 5.4, which differ in where the rotation axis lies.
+    """The two readings of thesis eq. 5.4, which differ in the place of the rotation axis.
 
     With every parameter of dO and tau free they describe the same set of geometries; the values of
     dO_x and dO_z differ by tau_x and tau_z.
@@ -62,8 +63,8 @@ class Reading(enum.Enum):
     AXIS_AT_O_PLUS_TAU = "axis at O + tau"
     """As printed: tau + R (b - tau) + O. The one `Poses.cone_vec` and corrections use."""
     MOUNT_SHIFT = "R (b - tau) + O"
-    """The axis stays at O and the phantom is shifted by -tau on its mount: what the thesis's two
-    groups of real scans are consistent with."""
+    """The axis stays at O and the phantom is shifted by -tau on its mount: the reading
+    with which the thesis's two groups of real scans are consistent."""
 
     @property
     def pivot(self) -> float:
@@ -72,7 +73,7 @@ class Reading(enum.Enum):
 
 
 class Centre(enum.Enum):
-    """What a measured bead position is; the value is the sphere-centre bias factor."""
+    """Kind of a measured bead position; the value is the sphere-centre bias factor."""
 
     POINT = 0.0
     """The projection of the bead's centre itself (simulated points)."""
@@ -82,20 +83,21 @@ class Centre(enum.Enum):
 
 @dataclass(frozen=True)
 class ColumnLayout:
-    """Which column of the normal equations means what.
+    """Meaning of the columns of the normal equations.
 
     Attributes:
         names: label of each column: a parameter, `parameter@group`, `bead k x|y|z`, `strain ab`,
             `arc`, or `panel term`.
-        asked: so many columns were asked for; those after them are there for their prior.
+        asked: number of requested columns; those after them are there for their prior.
         colmap: (groups, 17) column of each group's parameter, -1 if not free.
         bead_column: first column of the beads' coordinates, -1 if fixed.
-        strain_column: first column of the phantom's strain, -1 if it has none.
-        arc_column: of the exposure's arc, -1 if it has none.
+        strain_column: first column of the phantom's strain, -1 without strain.
+        arc_column: of the exposure's arc, -1 without arc.
         parameter_count: columns that are geometric parameters; all others come after.
-        panel_column: first column of the panel's distortion, the last; as many as columns if none.
+        panel_column: first column of the panel's distortion, the last ones; the number of
+            columns without distortion.
         active: indices of parameters that have a column in at least one group.
-        held: parameters asked for but held by the gauge, with the reason.
+        held: requested parameters that the gauge holds, with the reason.
     """
 
     names: tuple[str, ...]
@@ -133,7 +135,7 @@ def require_names(names: Iterable[str]) -> None:
     """Check that every name is a parameter.
 
     Raises:
-        UnknownNameError: says which there are.
+        UnknownNameError: lists the allowed names.
     """
     for name in names:
         if name not in NAMES:
@@ -174,14 +176,14 @@ def layout(
         per_group: those of `free` that have a value of their own in every group.
         beads: number of beads.
         free_beads: whether the beads' coordinates are unknowns too.
-        priors: names of parameters with a prior; each has a column, asked for or not.
+        priors: names of parameters with a prior; each has a column, requested or not.
         panel: terms of the panel's distortion.
         strained: whether the phantom may be strained.
         arc: whether the object may turn while a frame is exposed.
 
     Raises:
         UnknownNameError: a name that is no parameter.
-        TwinError: `per_group` names something that is not free.
+        TwinError: `per_group` names a parameter that is not free.
     """
     require_names((*free, *per_group, *priors))
     for name in per_group:
@@ -238,7 +240,7 @@ def layout(
 
 @dataclass(frozen=True, eq=False)
 class FitProblem:
-    """Everything the kernels need; arrays are C-contiguous float64 / int64 / bool.
+    """All input of the kernels; arrays are C-contiguous float64 / int64 / bool.
 
     Attributes:
         poses: nominal geometry of the n frames.
@@ -252,9 +254,10 @@ class FitProblem:
         reading: of eq. 5.4.
         bias: (n, k) sphere-centre bias factor of each position.
         origin: (n, 2) pixel coordinates (column, row) of the detector's centre.
-        prior_mean, prior_sigma: of each column, internal units; sigma inf where there is none.
-        panel: terms of the panel's distortion; None: it has none.
-        curvature: (n, k, 2, 1) shifts of the positions by an exposure of a whole step, or
+        prior_mean, prior_sigma: of each column, internal units; sigma inf without a
+            prior.
+        panel: terms of the panel's distortion; None: no distortion.
+        curvature: (n, k, 2, 1) shifts of the positions by an exposure of a full step, or
             (n, k, 2, 0): each exposure is an instant.
     """
 
@@ -286,7 +289,7 @@ class FitProblem:
 
     @cached_property
     def data(self) -> kernels.Data:
-        """What the kernels want of it."""
+        """The problem's arrays as the kernels take them."""
         p = self.poses
         return kernels.Data(
             np.column_stack([p.source, p.axis, p.detector, p.u, p.v, p.angle, p.mount[:, :2]]),
@@ -313,7 +316,8 @@ class FitProblem:
     @cached_property
     def _columns_of_kernel(self) -> FloatArray | None:
         """(kernel's columns, columns) by which kernel columns follow from those of the layout;
-        None: they are the same."""
+        None: they are the same.
+        """
         if self.layout.strain_column < 0:
             return None
         count, own = self.layout.parameter_count, 3 * len(self.model)
@@ -327,7 +331,7 @@ class FitProblem:
         return out
 
     def spread(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Parameter sets (groups, 17) and beads (k, 3) for column values `x`."""
+        """Return parameter sets (groups, 17) and beads (k, 3) for column values `x`."""
         columns, own = self.layout.colmap, self.layout.bead_column
         params = np.where(columns < 0, self.base, np.append(x, 0.0)[columns])
         beads = self.model.beads if own < 0 else x[self.layout.bead_columns].reshape(-1, 3)
@@ -350,14 +354,17 @@ class FitProblem:
         return self.panel.terms(self.measured + self.origin[:, None, :])
 
     def parameters(self, x: FloatArray) -> tuple[Offsets, ...]:
-        """The geometry of each group for column values `x`, in the reading corrections use."""
+        """Return the geometry of each group for column values `x`, in the reading of
+        corrections.
+        """
         params, _ = self.spread(x)
         return tuple(to_printed_reading(Offsets(*row), self.reading) for row in params)
 
     def residuals(
         self, x: FloatArray, use: npt.NDArray[np.bool_] | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Predicted pixels (n, k, 2) on the panel as it is, and whitened residual lengths (n, k).
+        """Predict pixels (n, k, 2) on the panel as it is, and lengths (n, k) of whitened
+        residuals.
 
         Lengths are -1 where a position is not used.
         """
@@ -365,7 +372,9 @@ class FitProblem:
         return predicted + self.origin[:, None, :], norms
 
     def whitened(self, x: FloatArray) -> FloatArray:
-        """Whitened residuals (n, k, 2), measured minus predicted, in the order of `jacobian`."""
+        """Compute whitened residuals (n, k, 2), measured minus predicted, in the order of
+        `jacobian`.
+        """
         predicted = self.residuals(x)[0]
         w = self.whiten
         off = self.measured + self.origin[:, None, :] - predicted
@@ -374,7 +383,9 @@ class FitProblem:
         )
 
     def jacobian(self, x: FloatArray, use: npt.NDArray[np.bool_] | None = None) -> FloatArray:
-        """Whitened rows d(column, row)/dx, (2 n k, columns); rows of unused positions are 0."""
+        """Compute whitened rows d(column, row)/dx, (2 n k, columns); rows of unused
+        positions are 0.
+        """
         return self._evaluate(x, self.seen if use is None else use, 2)[2]
 
     def _evaluate(
@@ -388,8 +399,15 @@ class FitProblem:
     def evaluate(
         self, x: FloatArray, use: npt.NDArray[np.bool_], want: int, huber: float = math.inf
     ) -> tuple[float, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """The cost of column values, and what `fit_kernels.evaluate` writes: predicted, norms, jac,
-        hess, grad; arguments as there."""
+        """Evaluate column values by `fit_kernels.evaluate`.
+
+        Args:
+            x: (c,) column values.
+            use, want, huber: as of the kernel.
+
+        Returns:
+            Cost, predicted, norms, jac, hess and grad.
+        """
         x = np.asarray(x, dtype=np.float64)
         params, beads = self.spread(x)
         table = self._columns_of_kernel
@@ -415,14 +433,15 @@ class FitProblem:
         return np.where(self.seen[..., None], self.measured + self.origin[:, None, :], np.nan)
 
     def prior_weight(self, noise: float) -> FloatArray:
-        """Weight of each column's prior beside whitened residuals of that spread; 0 if it has none.
+        """Compute the weight of each column's prior against whitened residuals of that
+        spread; 0 without one.
 
         Priors are absolute, and the residuals only known up to their spread s: s^2 / sigma^2.
         """
         return np.asarray((noise / self.prior_sigma) ** 2)
 
     def with_base(self, base: FloatArray) -> FitProblem:
-        """The same data with other starts, one row of seventeen values for each group."""
+        """Return the problem with other starts, one row of seventeen values for each group."""
         return replace(self, base=base)
 
 
@@ -451,7 +470,7 @@ def build_problem(
     """Check the arguments of a fit and put them into arrays; see `fit_geometry` for each.
 
     Raises:
-        TwinError: shapes do not fit together, or there is nothing to fit.
+        TwinError: shapes do not fit together, or no position was measured.
         UnknownNameError: a name that is no parameter.
     """
     poses = as_poses(geometry)
@@ -511,7 +530,7 @@ def build_problem(
 
 
 def strain_widths(strain: Strain) -> FloatArray:
-    """Standard deviation of each of STRAINS, (10,)."""
+    """Return the standard deviation of each of STRAINS, (10,)."""
     stretch, shear = (max(width, LEAST_STRAIN) for width in strain)
     return np.array([stretch] * STRETCHES + [shear] * (len(STRAINS) - STRETCHES))
 
@@ -519,7 +538,8 @@ def strain_widths(strain: Strain) -> FloatArray:
 def curvature(
     poses: Poses, model: BeadModel, base: FloatArray, group: npt.NDArray[np.int64], reading: Reading
 ) -> FloatArray:
-    """Shifts (n, k, 2, 1) [px] of the beads' mean positions if each exposure lasts a whole step.
+    """Compute shifts (n, k, 2, 1) [px] of the beads' mean positions by exposures of a
+    full step.
 
     A path p of the angle has the mean p + p'' arc^2 / 24 over an arc about it, to the fourth power
     of the arc: 2e-4 px of 100 px for a step of 15 deg.
@@ -550,7 +570,7 @@ def curvature(
 
 
 def frame_shapes(shape: Shape, frames: int) -> FloatArray:
-    """Detector (rows, cols) of each frame, (n, 2).
+    """Return the detector (rows, cols) of each frame, (n, 2).
 
     Raises:
         TwinError: `shape` is neither (2,) nor (n, 2).
@@ -566,7 +586,7 @@ def frame_shapes(shape: Shape, frames: int) -> FloatArray:
 
 
 def as_poses(geometry: Poses | ConeVec) -> Poses:
-    """Poses of a nominal geometry.
+    """Return the poses of a nominal geometry.
 
     Raises:
         GeometryError: `Poses.from_cone_vec` cannot read the stage angles from the rows.
@@ -575,7 +595,7 @@ def as_poses(geometry: Poses | ConeVec) -> Poses:
 
 
 def bias_factors(centre: Centre | npt.ArrayLike, shape: tuple[int, int]) -> FloatArray:
-    """Sphere-centre bias factor of every position, (n, k).
+    """Return the sphere-centre bias factor of every position, (n, k).
 
     Raises:
         TwinError: an array of another shape.
@@ -591,7 +611,12 @@ def bias_factors(centre: Centre | npt.ArrayLike, shape: tuple[int, int]) -> Floa
 def whitening(
     covariances: npt.ArrayLike | None, noise_px: float, seen: npt.NDArray[np.bool_]
 ) -> FloatArray:
-    """Upper triangular W with W C W' = 1 for each detection, as (n, k, 3): w0, w1, w2.
+    """Compute upper triangular W with W C W' = 1 for each detection, as (n, k, 3): w0, w1, w2.
+
+    Args:
+        covariances: (n, k, 2, 2) [px^2], or None.
+        noise_px: standard deviation of all coordinates, without covariances.
+        seen: (n, k) positions that were measured; others get 0.
 
     Raises:
         TwinError: a covariance of a seen bead is not positive definite, or noise_px <= 0.
@@ -624,21 +649,21 @@ def whitening(
 
 
 def values_in(p: Offsets) -> FloatArray:
-    """The seventeen values of `p` in the order of NAMES, internal units."""
+    """List the seventeen values of `p` in the order of NAMES, internal units."""
     return np.array([getattr(p, name) for name in NAMES])
 
 
 def to_printed_reading(p: Offsets, reading: Reading) -> Offsets:
-    """Values in `reading` to the reading of `Poses.cone_vec` (the axis at O + tau)."""
+    """Convert values in `reading` to the reading of `Poses.cone_vec` (the axis at O + tau)."""
     return p if reading.pivot else replace(p, dO_x=p.dO_x - p.tau_x, dO_z=p.dO_z - p.tau_z)
 
 
 def from_printed_reading(p: Offsets, reading: Reading) -> Offsets:
-    """The inverse of `to_printed_reading`."""
+    """Convert values in the reading of `Poses.cone_vec` to `reading`."""
     return p if reading.pivot else replace(p, dO_x=p.dO_x + p.tau_x, dO_z=p.dO_z + p.tau_z)
 
 
 def edge_factor(column: str) -> float:
-    """Edge units per internal unit of a column (deg per rad, else 1)."""
+    """Return the edge units per internal unit of a column (deg per rad, else 1)."""
     name = column.split("@")[0]
     return to_edge(name, 1.0) if name in NAMES else 1.0

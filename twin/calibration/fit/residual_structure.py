@@ -1,4 +1,4 @@
-"""Structure in residuals that white noise does not have, and what it does to the covariance.
+"""Structure in residuals that white noise does not have, and its effect on the covariance.
 
 Three questions: are residuals correlated from frame to frame (slow errors), or within a frame
 (a vibration moves all beads together), and do they follow a drift or a jump of a parameter during
@@ -19,16 +19,16 @@ from flexdt.twin.calibration.fit.problem import FitProblem
 from flexdt.twin.geometry.conventions import FloatArray
 
 SIGNIFICANT = 4.5
-"""Standard deviations a test statistic must exceed to be called found."""
+"""Standard deviations from which a test statistic is significant."""
 SUSPECT = 2.3
-"""The same for a steady drift to be allowed for without being called found: a drift that just
+"""The same for a steady drift to be allowed for without being reported: a drift that just
 escapes notice moves a parameter by 1.7 times its score."""
 SUSPECT_STEP = 3.5
 """The same for jumps, of which many are tried."""
 TOGETHER = 3.2
 """The same for errors that the beads of a frame share."""
 HARMONICS = 3
-"""Of the turn, in which errors of single beads are sought."""
+"""Number of harmonics of the turn in which errors of single beads are sought."""
 HINT = 1.5
 """The same for a second drift once a first is found."""
 MOVING = ("dO_x", "dO_y", "dO_z", "alpha")
@@ -45,7 +45,7 @@ class Drift:
         size: end minus start, edge unit.
         step_at: frame of a jump, or None for a steady drift.
         score: its size in standard deviations.
-        bias: (p,) what it does to the fitted values, edge units.
+        bias: (p,) its effect on the fitted values, edge units.
     """
 
     column: str
@@ -56,7 +56,7 @@ class Drift:
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """a.T @ b of two tall matrices, (m, i) and (m, j), in one thread.
+    """Compute a.T @ b of two tall matrices, (m, i) and (m, j), in one thread.
 
     These products are too small for BLAS threads, which cost more than the work and spin where the
     cores are busy.
@@ -66,7 +66,7 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """What a fit of p columns leaves at its m used coordinates, and what it knows.
+    """Residuals of a fit of p columns at its m used coordinates, and its covariance.
 
     Attributes:
         problem: for the columns and groups.
@@ -91,8 +91,9 @@ class Residuals:
 
 
 def drifts(left: Residuals) -> tuple[Drift, ...]:
-    """Drifts and jumps of single parameters that the residuals follow, strongest first; or those
-    that they may follow, if none is certain.
+    """Find drifts and jumps of single parameters in the residuals, strongest first.
+
+    If none is certain, the possible ones are returned.
     """
     problem, jacobian, residual, frame = left.problem, left.jacobian, left.values, left.frame
     unit_covariance, noise = left.unit_covariance, left.noise
@@ -143,7 +144,11 @@ def drifts(left: Residuals) -> tuple[Drift, ...]:
 
 
 def cluster_covariance(left: Residuals) -> FloatArray | None:
-    """Covariance (p, p) that allows for errors all beads of a frame share; None if not needed."""
+    """Compute the covariance (p, p) that allows for errors all beads of a frame share.
+
+    Returns:
+        None if it is not needed.
+    """
     problem, jacobian, residual, frame = left.problem, left.jacobian, left.values, left.frame
     unit_covariance, noise = left.unit_covariance, left.noise
     frames, member = np.unique(frame, return_inverse=True)
@@ -172,12 +177,16 @@ def cluster_covariance(left: Residuals) -> FloatArray | None:
 
 
 def turning_errors(left: Residuals) -> FloatArray | None:
-    """Covariance (p, p) to add for errors of a bead that repeat as the object turns; None if none.
+    """Compute the covariance (p, p) to add for errors of a bead that repeat as the object
+    turns.
 
-    Bead positions that are off, a background that pulls centroids, distortion of the detector: each
-    bead's error is then a smooth function of the angle. Its harmonics 0 to 3 are sought in every
-    bead's columns and rows. What is found in one bead is assumed in all, and in harmonic 0, most of
-    which the fit hides, as much as in any other.
+    Bead positions that are off, a background that pulls centroids, distortion of the
+    detector: each bead's error is then a smooth function of the angle. Its harmonics 0 to
+    3 are sought in every bead's columns and rows. An error found in one bead is assumed
+    in all, and in harmonic 0, most of which the fit hides, as much as in any other.
+
+    Returns:
+        None if there are no such errors.
     """
     problem, jacobian, residual, keep = left.problem, left.jacobian, left.values, left.keep
     unit_covariance, noise = left.unit_covariance, left.noise
@@ -252,7 +261,18 @@ def _excess(
     which: npt.NDArray[np.bool_],
     parameters: int,
 ) -> FloatArray | None:
-    """Squared amplitude of some columns beyond what noise gives, or None if not significant."""
+    """Compute squared amplitudes of some columns beyond noise.
+
+    Args:
+        gram: (c, c) products of the columns.
+        push: (c,) products with the residuals.
+        residual: (m,).
+        which: (c,) columns to judge.
+        parameters: number of fitted columns.
+
+    Returns:
+        None if not significant.
+    """
     part = gram[np.ix_(which, which)]
     power = np.maximum(np.diag(part), 1e-30)
     spread = float(residual @ residual) / max(len(residual) - parameters, 1)
@@ -273,7 +293,9 @@ def _excess(
 
 
 def larger(a: FloatArray, b: FloatArray) -> FloatArray:
-    """The smallest covariance of a's shape that is at least as wide as both in every direction."""
+    """Compute the smallest covariance of a's shape that is at least as wide as both in
+    every direction.
+    """
     # Of exact positions `a` is the priors' alone and of lower rank.
     low = np.linalg.cholesky(a + 1e-12 * np.diag(np.diag(a)))
     inverse = np.linalg.inv(low)
@@ -285,7 +307,7 @@ def larger(a: FloatArray, b: FloatArray) -> FloatArray:
 def correlation_length(
     residual: FloatArray, use: npt.NDArray[np.bool_], group: npt.NDArray[np.int64]
 ) -> float:
-    """Correlation length of residuals along the frames.
+    """Estimate the correlation length of residuals along the frames.
 
     It is 1 + 2 sum(rho) over the lags until the correlation first falls below noise: the
     number of frames that count as one. It stays 1 unless lag one is significant (4 sigma), so

@@ -1,7 +1,8 @@
 """Directions of parameter space that the data do not determine, by name and with advice.
 
-A direction is a combination of parameters; its text says which parameters trade against which and
-what would separate them. `certificate` decides which directions are null or weak.
+A direction is a combination of parameters; its text names the parameters that trade
+against each other and the data that would separate them. `certificate` decides which
+directions are null or weak.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import UNITS
 
 TOLERANCE = {"mm": 0.2, "deg": 0.2, "1": 5e-4}
-"""Standard deviation per unit above which a parameter counts as weak: the thesis calls a
+"""Unit -> standard deviation above which a parameter counts as weak: the thesis calls a
 calibration successful below 0.2 (mm, deg); for angle_scale, 0.2 deg in a turn."""
 
 BOUND = 5.0
@@ -23,7 +24,7 @@ BOUND = 5.0
 angle_scale it is 5 deg in a turn."""
 
 SHOWN = 3
-"""So many columns are named beside the first."""
+"""Largest number of columns named after the first."""
 _OBJECT = {"dO_x", "dO_y", "dO_z"}
 _DETECTOR = {"dD_x", "dD_y", "dD_z"}
 _SOURCE = {"dS_x", "dS_y"}
@@ -38,7 +39,7 @@ class Direction:
         parts: (column, change in edge units), largest share first; the first change is 1 by
             convention.
         sigma: standard deviation along the direction, in units of the first part; inf if null.
-        advice: what would determine it.
+        advice: data that would determine it.
     """
 
     parts: tuple[tuple[str, float], ...]
@@ -68,17 +69,22 @@ class Direction:
 
 
 def unit_of(column: str) -> str:
-    """Edge unit of a column; bead coordinates are in mm."""
+    """Return the edge unit of a column; bead coordinates are in mm."""
     return UNITS.get(column.split("@")[0], "mm")
 
 
 def tolerance_of(column: str) -> float:
-    """Standard deviation above which this column counts as weak, edge unit."""
+    """Return the standard deviation above which a column counts as weak, edge unit."""
     return TOLERANCE[unit_of(column)]
 
 
 def advise(names: Sequence[str], beads: int) -> str:
-    """What would determine a direction made of `names`, for a phantom seen with `beads` beads."""
+    """Advise on data that would determine a direction.
+
+    Args:
+        names: its columns.
+        beads: number of beads seen.
+    """
     involved = {n.split("@")[0] for n in names}
     if beads < 2:
         return "one bead alone fixes neither the scale nor the angle: use two or more beads"
@@ -156,7 +162,9 @@ def weak_direction(
 
 
 def _sparse(basis: FloatArray) -> FloatArray:
-    """The same space with each vector free of the others' leading parameter (echelon form)."""
+    """Transform a basis so that each vector lacks the others' leading parameter (echelon
+    form).
+    """
     m = basis.T.copy()
     r = len(m)
     for i in range(r):
