@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from concurrent.futures import Executor
 
 EVERY_S = 2.0
-"""Between lines of progress."""
+"""Interval between lines of progress [s]."""
 
 
 def batch(

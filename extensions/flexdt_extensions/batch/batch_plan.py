@@ -55,7 +55,7 @@ class Draw:
     values: tuple[Value, ...]
 
     def sample(self, rng: Generator) -> Any:
-        """One value: float, int or str, as the plan has them."""
+        """Draw one value: float, int or str, as the plan has them."""
         return _SAMPLERS[self.kind](self.values, rng)
 
     @property
@@ -73,7 +73,7 @@ class Draw:
         return max(float(v) for v in self.values)
 
     def to_plain(self) -> object:
-        """As plans write it."""
+        """Convert to the form that plans have in TOML."""
         return self.values[0] if self.kind == "fixed" else {self.kind: list(self.values)}
 
 
@@ -93,10 +93,13 @@ def _number(value: object) -> bool:
 
 
 def parse(value: object) -> Draw:
-    """A draw from what TOML holds.
+    """Parse a draw from a value of TOML.
+
+    Args:
+        value: a number, a text, or a table of one kind and its list.
 
     Raises:
-        ValueError: says what is allowed.
+        ValueError: another form; lists the allowed ones.
     """
     if isinstance(value, Draw):
         return value
@@ -175,7 +178,7 @@ def _fixed(value: float | str) -> Draw:
 
 
 class Batch(_Table):
-    """What to make, and how many."""
+    """Kind, number, seed and name of the batch's items."""
 
     name: Annotated[str, Len(1, 120)]
     kind: Literal["projections", "calibrations"]
@@ -207,7 +210,7 @@ class Spheres(_Table):
 
 
 class PhantomTable(_Table):
-    """What is scanned: one of three."""
+    """The scanned phantom: one of three forms."""
 
     name: Name | None = Field(default=None, description="as `flexdt phantom list` has them")
     cuboid: Cuboid | None = None
@@ -335,6 +338,12 @@ class Plan(_Table):
 
     @model_validator(mode="after")
     def _fits(self) -> Plan:
+        """Check tables against each other: errors' names, kind, phantom, images and
+        camera.
+
+        Raises:
+            ValueError: two of them do not go together.
+        """
         wrong = [n for n in self.errors if n not in NAMES]
         if wrong:
             raise ValueError(f"errors: unknown parameters {wrong}; allowed: {', '.join(NAMES)}")
@@ -364,7 +373,7 @@ class Plan(_Table):
 
 
 def parse_plan(document: dict[str, Any], name: str = "plan") -> Plan:
-    """A plan from a document.
+    """Validate a document and return its plan.
 
     Raises:
         CommandError: every problem with its key path.
@@ -376,7 +385,7 @@ def parse_plan(document: dict[str, Any], name: str = "plan") -> Plan:
 
 
 def read_plan(path: Path) -> Plan:
-    """A plan from a TOML file.
+    """Read a plan from a TOML file.
 
     Raises:
         CommandError: no TOML, or every problem with its key path.

@@ -72,11 +72,12 @@ class Store:
         self._log.close()
 
     def missing(self) -> Iterator[int]:
-        """Items that are not done, in order."""
+        """Iterate over the items that are not done, in order."""
         return (i for i in range(self.plan.batch.items) if i not in self.records)
 
     def put(self, outcome: ItemOutcome) -> None:
-        """Keep an item; once its shard is whole, that: its arrays first, then its lines."""
+        """Keep an item; write its shard as soon as that is complete: arrays first,
+        then log lines."""
         self._waiting[outcome.index] = outcome
         shard = self._shard(outcome.index)
         if any(i not in self._waiting for i in shard):
@@ -96,7 +97,11 @@ class Store:
         return range(start, min(start + size, self.plan.batch.items))
 
     def finish(self) -> dict[str, Any]:
-        """Write tables and manifest; returns the manifest. Only when nothing is missing."""
+        """Write tables and manifest, after all items are done.
+
+        Returns:
+            The manifest: plan, arrays, counts, figures, items and their checksum.
+        """
         items = [self.records[i] for i in range(self.plan.batch.items)]
         self._tables(items)
         arrays = {n: {"shape": list(s), "dtype": d} for n, (s, d) in layout(self.plan).items()}
@@ -117,7 +122,7 @@ class Store:
     # -- helpers -------------------------------------------------------------------------------
 
     def _sort_log(self, items: list[dict[str, Any]]) -> None:
-        """The log in the items' order, whatever the order they came in."""
+        """Sort the log by item, independent of the order of completion."""
         self._log.close()
         lines = [_canonical(record) + "\n" for record in (self._head, *items)]
         write_whole(self._log_path, "".join(lines))
@@ -129,7 +134,14 @@ class Store:
         os.fsync(self._log.fileno())
 
     def _read(self) -> bool:
-        """Read the log of finished items; a line that a crash cut off is dropped."""
+        """Read the log of finished items; a line that a crash cut off is dropped.
+
+        Returns:
+            Whether there was a log of this plan.
+
+        Raises:
+            CommandError: the folder belongs to another plan, or to no batch.
+        """
         if not self._log_path.exists():
             if any(self.folder.iterdir()):
                 raise CommandError(
@@ -156,16 +168,24 @@ class Store:
             self.records[int(record["index"])] = record
         begun = Counter(self._shard(i) for i in self.records)
         for shard, count in begun.items():
-            if count < len(shard):  # its lines were cut off: its items are made once more
+            if count < len(shard):  # its lines were cut off: its items are computed again
                 for i in shard:
                     self.records.pop(i, None)
         return True
 
     def _open(self, known: bool) -> dict[str, Any]:
+        """Open the arrays of the batch, or create them.
+
+        Args:
+            known: whether the folder has a log of this plan.
+
+        Returns:
+            Name -> Zarr array (items, ...).
+        """
         zarr = _zarr()
         where, wanted = self.folder / "data.zarr", layout(self.plan)
         if known:
-            for leftover in where.rglob("*.partial"):  # what Zarr was writing at a crash
+            for leftover in where.rglob("*.partial"):  # files that Zarr left at a crash
                 leftover.unlink()
             root = zarr.open_group(where, mode="r+", zarr_format=3)
             if all(name in root for name in wanted):
@@ -183,7 +203,11 @@ class Store:
         }  # fmt: skip
 
     def _tables(self, items: list[dict[str, Any]]) -> None:
-        """Write figures as arrays too, so that readers need not parse the manifest."""
+        """Write figures as arrays too, so that readers need not parse the manifest.
+
+        Args:
+            items: records of all items, in order.
+        """
         root = _zarr().open_group(self.folder / "data.zarr", mode="r+", zarr_format=3)
         done = np.array([i["status"] == "done" for i in items])
         tables: dict[str, np.ndarray[Any, Any]] = {"done": done}
@@ -207,12 +231,13 @@ def _zarr() -> Any:
 
 
 def open_arrays(folder: Path) -> Any:
-    """The arrays of a batch by name, for reading; raises TwinError where zarr is not installed."""
+    """Open the arrays of a batch for reading, by name; raises TwinError where zarr is
+    not installed."""
     return _zarr().open_group(folder / "data.zarr", mode="r")
 
 
 def figures(items: list[dict[str, Any]]) -> dict[str, Any]:
-    """What calibrations came to, over the identifiable ones; empty for images.
+    """Sum up the identifiable calibrations; empty for images.
 
     Returns:
         Counts, and for each parameter the mean absolute error, the root mean square of error over
@@ -244,7 +269,7 @@ _AXES: Final = {
 
 
 def _table(rows: list[dict[str, float | None]], names: list[str]) -> np.ndarray[Any, Any]:
-    """(items, names) float64, nan where there is none."""
+    """Make a table (items, names) float64; nan for a missing value."""
     values = [[row.get(name) for name in names] for row in rows]
     return np.array(values, dtype=np.float64).reshape(len(rows), len(names))
 
@@ -254,14 +279,14 @@ def _canonical(value: object) -> str:
 
 
 def write(path: Path, document: object) -> None:
-    """A JSON file that is there whole or not at all."""
+    """Write a JSON file in one step: complete or not at all."""
     write_whole(path, json.dumps(document, indent=1, sort_keys=True) + "\n")
 
 
 IN_FLIGHT = 512
-"""Items with the workers at a time: enough for a cluster."""
+"""Largest number of items submitted at a time: enough for a cluster."""
 IN_MEMORY = 2 * 2**30
-"""Bytes of outcomes that may wait for the store."""
+"""Largest size of the outcomes that wait for the store [bytes]."""
 
 Tell = Callable[[int, int, float], None]
 
@@ -273,15 +298,15 @@ def run_batch(
 
     Args:
         plan: of the batch.
-        out: its folder; an interrupted batch of the same plan is taken up.
-        workers: an executor, entered only if something is missing.
+        out: its folder; an interrupted batch of the same plan is continued.
+        workers: an executor, entered only if items are missing.
         tell: called with items done, items in all and items a second after each.
 
     Returns:
-        Summary: counts, time, throughput, where things are.
+        Summary: counts, time, throughput and paths.
 
     Raises:
-        CommandError: another plan's folder; or a worker died (what is done stays done).
+        CommandError: another plan's folder; or a worker died (completed items stay).
         TwinError: zarr is not installed, no such machine, or no workers.
     """
     store = Store(out, plan)
@@ -313,6 +338,17 @@ def run_batch(
 
 
 def _work(store: Store, pool: Executor, started: float, tell: Tell | None) -> None:
+    """Compute the missing items on the pool and store each outcome as it comes.
+
+    Args:
+        store: of the batch.
+        pool: entered executor.
+        started: time of the start, of `time.perf_counter` [s].
+        tell: called with items done, items in all and items a second; None for none.
+
+    Raises:
+        CommandError: a worker died.
+    """
     text, todo = store.plan.text, store.missing()
     in_flight = max(4, min(IN_FLIGHT, IN_MEMORY // item_bytes(store.plan)))
     begun = len(store.records)

@@ -25,10 +25,11 @@ Sample = dict[str, Any]
 
 @dataclass(frozen=True)
 class Augment:
-    """Physics drawn anew for each item and epoch, on line integrals.
+    """Random physics for each item and epoch, on line integrals.
 
     Attributes:
-        photons: lowest and highest open-beam photons of a pixel (loguniform), whose noise is added;
+        photons: lowest and highest open-beam photons of a pixel (loguniform), whose noise
+            is added;
             None adds none.
         shift_px: standard deviation of the detector's shift along columns and rows, which
             `cone_vec_true` follows and `cone_vec_nominal` does not.
@@ -53,7 +54,12 @@ class Augment:
             )
 
     def apply(self, sample: Sample, rng: np.random.Generator) -> None:
-        """Change a sample's projections, and the geometry they were truly made with."""
+        """Change a sample's projections, and the geometry they were truly made with.
+
+        Args:
+            sample: arrays by name; `projections` and `cone_vec_true` are replaced.
+            rng: of this item and epoch.
+        """
         from scipy.ndimage import shift
 
         images = sample["projections"]
@@ -75,22 +81,25 @@ class TrainingData:
     Args:
         folder: of the batch.
         augment: None leaves the items as they are.
-        seed: of what is drawn.
+        seed: of all random draws.
 
     Attributes:
-        epoch: part of what is drawn; raise it after each pass.
+        epoch: part of the seed; raise it after each pass.
 
     Raises:
-        CommandError: the folder holds no finished batch, or `augment` meets counts or noise.
+        CommandError: the folder holds no finished batch, or `augment` meets counts or
+            noise.
         TwinError: zarr is not installed.
 
     Example:
-        >>> data = TrainingData(Path("spheres"), Augment(photons=(1e3, 1e5)))  # doctest: +SKIP
+        >>> data = TrainingData(Path("spheres"), Augment(photons=(1e3, 1e5)))  # doctest:
+        +SKIP
         >>> data[17]["projections"].shape  # doctest: +SKIP
         (24, 48, 64)
     """
 
     def __init__(self, folder: Path | str, augment: Augment | None = None, seed: int = 0) -> None:
+        """Read the manifest and check that `augment` fits the images; see the class."""
         self.folder, self.augment, self.seed, self.epoch = Path(folder), augment, seed, 0
         file = self.folder / "manifest.json"
         if not file.is_file():
@@ -114,25 +123,27 @@ class TrainingData:
         return open_arrays(self.folder)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without open files, so that it travels to worker processes."""
+        """Drop open files, so that it travels to worker processes."""
         return {k: v for k, v in self.__dict__.items() if k != "_arrays"}
 
     def __len__(self) -> int:
         return len(self.indices)
 
     def __getitem__(self, number: int) -> Sample:
-        """An item: its arrays by name, and `index`, its number in the batch."""
+        """Return an item: its arrays by name, and `index`, its number in the batch."""
         index = int(self.indices[number])
         return self._finish(index, {name: self._arrays[name][index] for name in self.names})
 
     def order(self, rank: int = 0, ranks: int = 1) -> npt.NDArray[np.int64]:
-        """This epoch's order of the shards that a process out of several reads: no shard twice."""
+        """Return this epoch's order of the shards that one process of several reads;
+        no shard twice."""
         shards = np.unique(self.indices // self.shard)
         rng = np.random.default_rng((self.seed, self.epoch))
         return np.asarray(rng.permutation(shards)[rank::ranks])
 
     def shuffled(self, rank: int = 0, ranks: int = 1) -> Iterator[Sample]:
-        """This epoch's samples of a process: shards in `order`, each read once, shuffled inside."""
+        """Yield this epoch's samples of a process: shards in `order`, each read once,
+        shuffled inside."""
         for shard in self.order(rank, ranks).tolist():
             first = shard * self.shard
             part = {name: self._arrays[name][first : first + self.shard] for name in self.names}
@@ -149,7 +160,8 @@ class TrainingData:
 
 
 def stream(data: TrainingData, rank: int = 0, ranks: int = 1) -> Any:
-    """PyTorch's `IterableDataset` of `data.shuffled`, dealt among the workers of its `DataLoader`.
+    """Make PyTorch's `IterableDataset` of `data.shuffled`, dealt among its `DataLoader`'s
+    workers.
 
     Set `data.epoch` before each pass; workers that live on from pass to pass do not see it.
 

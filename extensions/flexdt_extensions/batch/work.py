@@ -55,11 +55,11 @@ from flexdt_extensions.batch.batch_plan import Cuboid, Plan, Spheres, parse_plan
 VALUES, NOISE, SHAPES = 0, 1, 2
 """Streams of an item's seed: scalar draws in the plan's order, noise, the phantom's parts."""
 TRIES: Final = 2000
-"""How often a sphere is placed anew before a phantom counts as impossible."""
+"""Largest number of places tried for a sphere before a phantom counts as impossible."""
 
 
 def seed_of(plan: Plan, index: int, *stream: int) -> np.random.SeedSequence:
-    """The seed of item `index`, or of one of its streams."""
+    """Return the seed of item `index`, or of one of its streams."""
     return np.random.SeedSequence(plan.batch.seed, spawn_key=(index, *stream))
 
 
@@ -68,8 +68,8 @@ class Item:
     """One item, ready to be computed.
 
     Attributes:
-        index: which.
-        phantom: what is scanned.
+        index: number in the batch.
+        phantom: the scanned one.
         poses: nominal.
         truth: hidden offsets, true minus nominal.
         shape: detector (rows, cols).
@@ -93,7 +93,11 @@ class Item:
 
 
 def draw_item(plan: Plan, index: int) -> Item:
-    """What item `index` of a plan is.
+    """Draw item `index` of a plan.
+
+    Args:
+        plan: of the batch.
+        index: number of the item; with the plan's seed it determines all draws.
 
     Raises:
         TwinError: a draw that no phantom or machine can be, e.g. beads that do not fit.
@@ -135,7 +139,7 @@ def draw_item(plan: Plan, index: int) -> Item:
 
 
 def detector_shape(plan: Plan) -> tuple[int, int]:
-    """(rows, cols) of every image of a plan.
+    """Return (rows, cols) of every image of a plan.
 
     Raises:
         TwinError: no such machine, mode or ROI.
@@ -146,6 +150,20 @@ def detector_shape(plan: Plan) -> tuple[int, int]:
 def _camera(
     plan: Plan, machine: Machine
 ) -> tuple[CameraSettings | None, tuple[int, int], float, tuple[float, float]]:
+    """Determine the camera of a plan.
+
+    Args:
+        plan: its camera table and averages.
+        machine: of the plan.
+
+    Returns:
+        Camera (None for a made-up detector), shape (rows, cols), pixel [mm], shift of the
+        ROI
+        from the panel's centre (columns, rows) [mm].
+
+    Raises:
+        TwinError: the ROI is not on the sensor.
+    """
     wanted = plan.camera
     if wanted.shape is not None and wanted.pixel_mm is not None:
         return None, (wanted.shape[0], wanted.shape[1]), wanted.pixel_mm, (0.0, 0.0)
@@ -190,6 +208,19 @@ def _cuboid(table: Cuboid, rng: np.random.Generator) -> tuple[Phantom, dict[str,
 def _spheres(
     table: Spheres, rng: np.random.Generator, parts: np.random.Generator
 ) -> tuple[Phantom, dict[str, Any]]:
+    """Draw random spheres that do not touch, in a cylinder.
+
+    Args:
+        table: numbers, radii, materials and the cylinder.
+        rng: of the number of spheres.
+        parts: of radii, materials and places.
+
+    Returns:
+        The phantom, and its description for the manifest.
+
+    Raises:
+        TwinError: a sphere found no free place in `TRIES` tries.
+    """
     wide, high = table.within_radius_mm, table.within_height_mm / 2.0
     solids: list[Solid] = []
     listed: list[dict[str, Any]] = []
@@ -231,12 +262,13 @@ Counts = npt.NDArray[np.uint16]
 
 @dataclass(frozen=True, eq=False)
 class ItemOutcome:
-    """What came of an item.
+    """Result of an item.
 
     Attributes:
-        index: which.
-        record: its line in the manifest: seed, parameters, status, figures, sha256 of each array.
-        arrays: name -> values, as `layout` says.
+        index: number in the batch.
+        record: its line in the manifest: seed, parameters, status, figures, sha256 of
+            each array.
+        arrays: name -> values, with the shapes of `layout`.
     """
 
     index: int
@@ -245,7 +277,7 @@ class ItemOutcome:
 
 
 def layout(plan: Plan) -> dict[str, tuple[tuple[int, ...], str]]:
-    """Arrays of every item of a plan: name -> (shape, dtype).
+    """List the arrays of every item of a plan: name -> (shape, dtype).
 
     Raises:
         TwinError: no such machine, mode or ROI.
@@ -265,7 +297,7 @@ def layout(plan: Plan) -> dict[str, tuple[tuple[int, ...], str]]:
 
 
 def item_bytes(plan: Plan) -> int:
-    """Size of one item's arrays before compression."""
+    """Compute the size of one item's arrays before compression [bytes]."""
     return sum(
         math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in layout(plan).values()
     )
@@ -310,7 +342,7 @@ def run_item(text: str, index: int) -> ItemOutcome:
 
 
 def _open_beam_doubts(plan: Plan, item: Item) -> list[str]:
-    """Warn where counts of the open beam saturate or starve the panel."""
+    """List warnings where counts of the open beam saturate or starve the panel."""
     counted = plan.images.values == "counts" or plan.images.noise
     if plan.batch.kind != "projections" or item.camera is None or not counted:
         return []
@@ -322,6 +354,15 @@ def _open_beam_doubts(plan: Plan, item: Item) -> list[str]:
 
 
 def _projections(plan: Plan, item: Item) -> tuple[dict[str, Array], dict[str, Any]]:
+    """Compute an item's projections and, if the plan has it, their reconstruction.
+
+    Args:
+        plan: of the batch.
+        item: drawn.
+
+    Returns:
+        `projections` (frames, rows, cols) and `volumes` (z, y, x); no figures.
+    """
     cone = item.poses.cone_vec(item.truth)
     if plan.images.physics == "ideal":
         images = _ideal(plan, item, cone)
@@ -358,12 +399,23 @@ def _ideal(plan: Plan, item: Item, cone: ConeVec) -> Array:
 
 
 def _logarithm(counts: Counts, dark: np.float32, bright: np.float32 | Float32Array) -> Float32Array:
-    """-ln((counts - dark) / open beam); no count above dark is taken as half a one."""
+    """Compute -ln((counts - dark) / open beam); no count above dark is taken as half a
+    one."""
     above = np.maximum(counts.astype(np.float32) - dark, np.float32(0.5))
     return np.asarray(-np.log(above / bright), dtype=np.float32)
 
 
 def _physical(plan: Plan, item: Item, cone: ConeVec) -> Array:
+    """Make images with spectrum, panel and noise, as counts or as line integrals.
+
+    Args:
+        plan: of the batch.
+        item: with a machine's camera.
+        cone: true geometry.
+
+    Returns:
+        Images (frames, rows, cols).
+    """
     assert item.camera is not None
     parts = channels(item.phantom)
     panel, tube = detector_of(item.machine.detector), tube_of(item.machine.tube)
@@ -392,6 +444,15 @@ def _physical(plan: Plan, item: Item, cone: ConeVec) -> Array:
 
 
 def _calibrations(plan: Plan, item: Item) -> tuple[dict[str, Array], dict[str, Any]]:
+    """Calibrate an item, from noisy bead points or from rendered images.
+
+    Args:
+        plan: of the batch.
+        item: drawn.
+
+    Returns:
+        No arrays, and the figures of `_judged`.
+    """
     model = bead_model(item.phantom)
     free = tuple(plan.calibrate.free)
     if plan.calibrate.fidelity == "points":
@@ -419,7 +480,21 @@ def _calibrations(plan: Plan, item: Item) -> tuple[dict[str, Array], dict[str, A
 def _judged(
     fit: FitResult | None, item: Item, free: tuple[str, ...], identifiable: bool, note: str
 ) -> dict[str, Any]:
-    """Errors against the truth, in edge units, of the parameters that the data determine."""
+    """Compare a fit with the truth, in edge units, for the parameters that the data
+    determine.
+
+    Args:
+        fit: None where nothing was fitted.
+        item: its truth.
+        free: estimated parameters.
+        identifiable: whether the data determine them; else values are None.
+        note: findings as text.
+
+    Returns:
+        `identifiable`, `values`, `errors`, `sigmas`, `rms_px`, `iterations`, `note` and,
+        without a
+        fit, `error`.
+    """
     truth = item.truth.to_edge()
     estimates = {} if fit is None else fit.certificate.estimates
     values, errors, sigmas = {}, {}, {}
