@@ -9,7 +9,7 @@ from pathlib import Path
 from flexdt.extending import Answer, CommandError, names, option
 
 WRONG = 2
-"""Exit code of wrong options."""
+"""Exit code of invalid options."""
 
 
 def bench(

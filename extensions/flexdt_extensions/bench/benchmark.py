@@ -1,12 +1,13 @@
-"""The benchmark from end to end: cases, peers, times side by side, errors against exact lengths.
+"""The benchmark from end to end: cases, peers, times side by side, errors against exact
+lengths.
 
-Contestants run turn by turn, so that what disturbs one disturbs all; the minimum is what the
-machine can do, the median what one gets. `timed` and `plain` make entries of the benchmark's
-document.
+Contestants run turn by turn, so that a disturbance meets all; the minimum is the
+machine's best, the median the usual time. `timed` and `plain` make entries of the
+benchmark's document.
 
-The cases are data: volumes, geometries, detectors. C1, C2 and C3 are the cases that peers were
-measured with; the others are what nobody tuned for. Volumes are filled with random numbers, so no
-empty space is there to be skipped (but for the ball).
+The cases are data: volumes, geometries, detectors. C1, C2 and C3 are the cases that peers
+were measured with; no code was tuned for the others. Volumes are filled with random
+numbers, so no empty space can be skipped (but for the ball).
 """
 
 from __future__ import annotations
@@ -75,8 +76,17 @@ def circle(
     height: float = 0.0,
     above_deg: float = 0.0,
 ) -> ConeVec:
-    """Views on a full circle (object frame), the detector tilted about its normal, u and v; source
-    and detector turned together by `above_deg` about u, which brings the source above the object.
+    """Make views on a full circle, in the object frame.
+
+    Args:
+        views: number of views.
+        shape: detector (rows, cols).
+        sod, sdd: distances of source to axis and to detector [mm].
+        pitch: of pixels [mm]; None for that of `PITCH`.
+        tilt_deg: of the detector about its normal, u and v [deg].
+        height: of the source [mm].
+        above_deg: turn of source and detector about u, which brings the source above the
+            object [deg].
     """
     pixel = PITCH[shape] if pitch is None else pitch
     u, v, beam = np.array([1.0, 0, 0]), np.array([0, 0, -1.0]), np.array([0, 1.0, 0])
@@ -94,13 +104,13 @@ def circle(
 
 
 def noise(shape: tuple[int, int, int], voxel: float | tuple[float, float, float] = 0.1) -> Volume:
-    """A volume of random numbers, the same every time."""
+    """Make a volume of random numbers, the same every time."""
     values: Float32Array = np.random.default_rng(0).random(shape, dtype=np.float32)
     return Volume(values, voxel)
 
 
 def ball(side: int) -> Volume:
-    """A ball of a tenth of the volume's side in its middle, the rest empty."""
+    """Make a ball of a tenth of the volume's side in its middle, the rest empty."""
     values = np.zeros((side,) * 3, np.float32)
     n = side // 10
     x = np.arange(-n, n + 1)
@@ -111,7 +121,8 @@ def ball(side: int) -> Volume:
 
 
 def peer_cases() -> list[Case]:
-    """The cases of the targets."""
+    """List the cases that have targets: C1, C2, C3, tilted, from above, one row,
+    small."""
     c1, c2 = partial(noise, C1_SHAPE), partial(noise, C2_SHAPE)
     above = [
         Case(f"above-{e}", c1, circle(8, BINNED, above_deg=e), BINNED, True,
@@ -144,14 +155,14 @@ def peer_cases() -> list[Case]:
 
 
 def untuned_cases() -> list[Case]:
-    """Cases nobody tuned for: exact, and without a cliff in speed."""
+    """List cases that no code was tuned for: exact, and without a cliff in speed."""
     s, cube, strong = BINNED, (256, 256, 256), (45.0, 45.0, 45.0)
     # 60 degrees across the detector's diagonal.
     wide = 2 * math.tan(math.radians(30)) * 80.0 / math.hypot(*s)
     cone: dict[str, Any] = {"sod": 40.0, "sdd": 80.0, "pitch": wide}
     aslant = (LYING[0] + TILT_DEG[0], *TILT_DEG[1:])
     near, small = {"sod": 19.2, "sdd": 60.0, "pitch": 0.08}, (95, 120)
-    # Nearly parallel rays pass no z level: what is left is walking through the voxel columns.
+    # Nearly parallel rays pass no z level: only the walk through the voxel columns remains.
     far = {"sod": FAR * SOD, "sdd": FAR * SDD}
     rows: list[tuple[str, tuple[int, int, int], dict[str, Any], str]] = [
         ("cone-60", cube, cone, "60 degree cone"),
@@ -177,24 +188,24 @@ def untuned_cases() -> list[Case]:
 
 
 def all_cases() -> list[Case]:
-    """Every case that is a projection of voxels."""
+    """List every case that is a projection of voxels."""
     return [*peer_cases(), *untuned_cases()]
 
 
 def on_axis(shape: tuple[int, int]) -> ConeVec:
-    """One tilted view whose central ray runs along y."""
+    """Make one tilted view whose central ray runs along y."""
     view = circle(1, shape, tilt_deg=TILT_DEG)
     back = rotation_z(-START)
     return view.moved(back, (0.0, 0.0, 0.0))
 
 
 BUDGET_S = 6.0
-"""A contestant that has run this long runs no more rounds."""
+"""Time limit of a contestant: no more rounds after it [s]."""
 AT_LEAST, AT_MOST = 3, 15
-"""Rounds."""
+"""Least and largest number of rounds."""
 SHORT_S, MANY = 1.5, 150
-"""A contestant whose rounds took less than this in all runs up to so many: what else the machine
-does hides the best of a few short calls."""
+"""Limit of total time [s] below which a contestant runs up to so many rounds: other
+load hides the best of a few short calls."""
 
 
 @dataclass(frozen=True)
@@ -212,7 +223,7 @@ def interleaved(
     once: frozenset[str] = frozenset(),
     budget_s: float = BUDGET_S,
 ) -> dict[str, CallTime]:
-    """Time contestants turn by turn.
+    """Run contestants turn by turn and time them.
 
     Args:
         contestants: name to call; the first call of each is not counted (but for those in `once`,
@@ -243,7 +254,7 @@ def interleaved(
 
 
 def _enough(rounds: int, spent_s: float, budget_s: float) -> bool:
-    """Whether a contestant has run often enough."""
+    """Check whether a contestant has run often enough."""
     if rounds < AT_LEAST:
         return False
     most = MANY if spent_s < SHORT_S else AT_MOST
@@ -251,14 +262,16 @@ def _enough(rounds: int, spent_s: float, budget_s: float) -> bool:
 
 
 def errors(images: Float32Array, exact: Float32Array | FloatArray) -> tuple[float, float]:
-    """(mean, worst) absolute difference, as a share of the exact images' maximum."""
+    """Compute the (mean, worst) absolute difference, as a share of the exact images'
+    maximum."""
     top = float(exact.max())
     difference = np.abs(images.astype(np.float64) - exact)
     return float(difference.mean()) / top, float(difference.max()) / top
 
 
 def exact_images(volume: Volume, geometry: ConeVec, shape: tuple[int, int]) -> Float32Array:
-    """Every ray on its own in double precision (positions and sums), rounded once at the end."""
+    """Project every ray on its own in double precision (positions and sums), rounded
+    once at the end."""
     from flexdt.measuring import box_of, siddon_kernels, voxel_rays
 
     out = np.zeros((len(geometry), *shape), np.float32)
@@ -272,7 +285,8 @@ def exact_images(volume: Volume, geometry: ConeVec, shape: tuple[int, int]) -> F
 def sorted_crossings(
     volume: Volume, geometry: ConeVec, shape: tuple[int, int], pixels: FloatArray
 ) -> FloatArray:
-    """The same integrals by another way: all crossings of a ray, sorted, in NumPy.
+    """Compute the same integrals by another way: all crossings of a ray, sorted, in
+    NumPy.
 
     Args:
         pixels: (k, 3) view, row, column.
@@ -310,7 +324,18 @@ def timed(
     what: str,
     once: frozenset[str] = frozenset(),
 ) -> Entry:
-    """An entry for the call named flexdt beside those of the others."""
+    """Make an entry of the call named flexdt and those of the others.
+
+    Args:
+        name: of the case.
+        views: of each call.
+        calls: contestant -> call; one is "flexdt".
+        what: description of the case.
+        once: contestants that are called one time only.
+
+    Returns:
+        The entry, with times [ms per view] and ratios peer / flexdt.
+    """
     timing = interleaved(calls, once=once)
     ours = timing.pop("flexdt")
     entry = plain(name, ours.best * 1e3 / views, what)
@@ -328,7 +353,7 @@ def timed(
 
 
 def plain(name: str, ms: float, what: str) -> Entry:
-    """An entry of one time."""
+    """Make an entry of one time."""
     return {
         "name": name,
         "what": what,
@@ -344,19 +369,19 @@ def plain(name: str, ms: float, what: str) -> Entry:
 
 
 CHECKED = 300
-"""Rays of each case that are checked by a second, independent exact method."""
+"""Number of rays of each case that are checked by a second, independent exact method."""
 
 Tell = Callable[[str], None]
 Document = dict[str, Any]
 
 
 def case_names() -> list[str]:
-    """What `only` may name."""
+    """List the names that `only` accepts."""
     return [case.name for case in all_cases()]
 
 
 def listing() -> list[str]:
-    """A line for every name, with what it is."""
+    """List a line for every name, with its description."""
     return [f"{case.name:24} {case.what}" for case in all_cases()]
 
 
@@ -367,13 +392,16 @@ def run_bench(
 
     Args:
         only: names of cases to run, see `case_names`; all if empty.
-        with_peers: run other projectors beside ours.
-        tell: told a line of text as each result comes in.
+        with_peers: run other projectors too.
+        tell: called with a line of text for each result.
 
     Returns:
-        {machine, cases: [{name, views, ms_per_view, median_ms_per_view, mean_error, worst_error,
-        peers: {name: {ms_per_view, mean_error}}, ratio: {name: x}, ...}], growth: {}}; errors are
-        shares of the maximum against double-precision exact lengths, ratios are peer / flexdt.
+        {machine, cases: [{name, views, ms_per_view, median_ms_per_view, mean_error,
+        worst_error,
+        peers: {name: {ms_per_view, mean_error}}, ratio: {name: x}, ...}], growth: {}};
+            errors are
+        shares of the maximum against double-precision exact lengths, ratios are peer /
+        flexdt.
     """
     warm_up()
     found = peers() if with_peers else []
@@ -392,7 +420,15 @@ def run_bench(
 
 
 def run_case(case: Case, contestants: Sequence[Peer]) -> Document:
-    """One case: accuracy first, then everyone turn by turn."""
+    """Run one case: accuracy first, then all contestants turn by turn.
+
+    Args:
+        case: volume, views and detector.
+        contestants: peers; a slow one is left out of several views.
+
+    Returns:
+        The entry, see `run_bench`.
+    """
     volume = case.volume()
     views = len(case.geometry)
     out = np.empty((views, *case.shape), np.float32)
@@ -424,14 +460,19 @@ def run_case(case: Case, contestants: Sequence[Peer]) -> Document:
 
 
 def _some_pixels(exact: np.ndarray[Any, np.dtype[np.float32]]) -> np.ndarray[Any, Any]:
-    """Pixels in the volume's shadow, (k, 3) view, row, column, the same every time."""
+    """Draw pixels in the volume's shadow, (k, 3) view, row, column, the same every
+    time."""
     lit = np.flatnonzero(exact)
     chosen = np.random.default_rng(0).choice(lit, min(CHECKED, len(lit)), replace=False)
     return np.stack(np.unravel_index(chosen, exact.shape), axis=1).astype(np.float64)
 
 
 def machine(missing: Mapping[str, str | None]) -> Document:
-    """What the figures were measured on, when, and who took part (peer -> why not, or None)."""
+    """Describe the machine of the figures: time, processor, load, versions, peers.
+
+    Args:
+        missing: peer -> why it takes no part, or None.
+    """
     import llvmlite
     import numba
 
@@ -457,12 +498,13 @@ def machine(missing: Mapping[str, str | None]) -> Document:
 
 
 def load() -> float | None:
-    """Processes that wanted to run in the last minute, where the system says so."""
+    """Return the mean number of runnable processes in the last minute, where the
+    system has it."""
     return os.getloadavg()[0] if hasattr(os, "getloadavg") else None
 
 
 def line_of(entry: Document) -> str:
-    """One result for people."""
+    """Format one result for people."""
     text = f"{entry['name']:16} {entry['ms_per_view']:10.2f} ms"
     if entry["worst_error"] is not None:
         text += f"   mean {entry['mean_error']:.1e} worst {entry['worst_error']:.1e}"
@@ -472,5 +514,5 @@ def line_of(entry: Document) -> str:
 
 
 def to_stderr(line: str) -> None:
-    """Progress, apart from the document on standard output."""
+    """Print progress, apart from the document on standard output."""
     print(line, file=sys.stderr, flush=True)

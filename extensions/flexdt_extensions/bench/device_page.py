@@ -1,14 +1,15 @@
-"""`flexdt bench --device`: a CUDA device beside ASTRA on it, the processor and what it could do at
-best, each line of the targets for a GPU. Makes one document and one page; needs a device.
+"""`flexdt bench --device`: a CUDA device against ASTRA on it, the processor and its own
+bound, one line for each target of a GPU. Makes one document and one page; needs a device.
 
-Kernels are timed by the device's own events, with everything there; calls by the clock, from arrays
-of the host to arrays of the host. ASTRA's data are on the device, too. The bound is the larger of
-reading the volume once and of 16 instructions for each voxel that a ray passes.
+Kernels are timed by the device's own events, with all data there; calls by the clock,
+from arrays of the host to arrays of the host. ASTRA's data are on the device, too. The
+bound is the larger of reading the volume once and of 16 instructions for each voxel that
+a ray passes.
 
-ASTRA Toolbox is here as an independent second projector, for cross-checks on a machine with a GPU.
-It interpolates (Joseph) where flexdt takes exact lengths, so the two agree to its interpolation
-error only. Creating ASTRA's 3D objects without a GPU ends the process, so `gpu.availability` is
-asked first.
+ASTRA Toolbox is here as an independent second projector, for cross-checks on a machine
+with a GPU. It interpolates (Joseph) where flexdt takes exact lengths, so the two agree to
+its interpolation error only. Creating ASTRA's 3D objects without a GPU ends the process,
+so `gpu.availability` is checked first.
 """
 
 from __future__ import annotations
@@ -40,38 +41,46 @@ from flexdt_extensions.bench.scanned_objects import KINDS
 
 SIZES = {"C1": (C1_SHAPE, 0.1), "512^3": ((512,) * 3, 0.1), "1024^3": ((1024,) * 3, 0.05)}
 COUNTS = (1, 36, 360)
-"""Views a call."""
+"""Numbers of views a call."""
 PANEL = BINNED
 FDK_VIEWS = 1434
 ROUNDS = 5
 BESIDE_S = 2.0
-"""`back` and the processor's, each at least."""
+"""Least time of `back` and of the processor's, each [s]."""
 INSTRUCTIONS = 16
-"""For a voxel that a ray passes, at best."""
+"""Least number of instructions for a voxel that a ray passes."""
 AGAINST_ASTRA = {"C1": (2, 0.20, 0.15), "512^3": (2, 0.45, 0.30), "1024^3": (1, 0.40, 0.28)}
-"""Which of COUNTS, and the shares of ASTRA's time that are to be accepted and wanted."""
+"""Index into COUNTS, and the shares of ASTRA's time that are accepted and wanted."""
 OF_THE_BOUND = {"C1": (0.25, 0.45), "512^3": (0.30, 0.50), "1024^3": (0.80, 1.00)}
 CUT_OFF = 1.3
-"""FDK of any images over that of an object seen whole, at most."""
+"""Largest ratio of FDK's time for any images to that for a complete object."""
 WITH_ERRORS = 1.5
-"""FDK with `errors` over FDK without, at most."""
+"""Largest ratio of FDK's time with `errors` to that without."""
 ASTRA = "astra-toolbox"
 UNKNOWN_SPEED = "the device does not say how fast it is"
 Document = dict[str, Any]
 
 
 def on_the_clock(work: Callable[[], object], rounds: int = ROUNDS) -> float:
-    """Best of a few calls [ms], the device's work included; the first is not counted."""
+    """Measure the best of a few calls [ms], the device's work included; the first is
+    not counted."""
     return _best(work, rounds, lambda start, end: (end[0] - start[0]) * 1e3)
 
 
 def by_events(work: Callable[[], object]) -> float:
-    """Best of a few launches [ms], by the device's events; the first is not counted."""
+    """Measure the best of a few launches [ms] by the device's events; the first is not
+    counted."""
     return _best(work, ROUNDS, lambda start, end: float(start[1].elapsed_time(end[1])))
 
 
 def _best(work: Callable[[], object], rounds: int, apart: Callable[[Any, Any], float]) -> float:
-    """Least of what lies between (clock, event) before and after each call but the first."""
+    """Measure the best of several calls; the first is not counted.
+
+    Args:
+        work: call to measure.
+        rounds: counted calls.
+        apart: time between two pairs (clock [s], event), before and after a call.
+    """
     from numba import cuda
 
     def now() -> tuple[float, Any]:
@@ -89,7 +98,16 @@ def _best(work: Callable[[], object], rounds: int, apart: Callable[[Any, Any], f
 
 
 def run_device_bench(tell: Callable[[str], None]) -> Document:
-    """Measure everything on the device that was found: {device, cases, targets}."""
+    """Measure all targets on the device.
+
+    Args:
+        tell: called with a line of text for each result.
+
+    Returns:
+        {device, cases, targets}: name, case -> views -> times, and lines of {target,
+        accepted,
+        wanted, measured, met}.
+    """
     lines: list[Document] = []
 
     def line(what: str, value: float | None, accepted: float, wanted: float, sign: int = 1) -> None:
@@ -133,7 +151,15 @@ def run_device_bench(tell: Callable[[str], None]) -> Document:
 
 
 def case(name: str, tell: Callable[[str], None]) -> dict[int, Document]:
-    """One volume, by the number of views a call; times in ms for the whole call."""
+    """Measure one volume for each number of views a call.
+
+    Args:
+        name: of `SIZES`.
+        tell: called with a line of text for each number of views.
+
+    Returns:
+        Views -> times [ms] of the call, bytes of its images and errors.
+    """
     shape, voxel = SIZES[name]
     volume = noise((shape[0], shape[1], shape[2]), voxel)
     there, seen = volume.to("cuda"), {}
@@ -171,7 +197,12 @@ def case(name: str, tell: Callable[[str], None]) -> dict[int, Document]:
 
 
 def further(line: Callable[..., None], cases: dict[str, dict[int, Document]]) -> None:
-    """FDK and SIRT onto the second volume's grid."""
+    """Measure FDK and SIRT onto the second volume's grid.
+
+    Args:
+        line: adds a target: name, measured, accepted and wanted value.
+        cases: of `case`, by name.
+    """
     from numba import cuda
 
     from flexdt.measuring import gpu_fdk_kernels, view_table
@@ -216,7 +247,7 @@ def further(line: Callable[..., None], cases: dict[str, dict[int, Document]]) ->
 
 
 def _quietly(call: Callable[[], object]) -> Callable[[], object]:
-    """The same call without the warnings that these images deserve."""
+    """Wrap a call so that its warnings about these images are dropped."""
 
     def quiet() -> object:
         with warnings.catch_warnings():
@@ -238,7 +269,8 @@ def why_no_astra() -> str | None:
 
 
 def astra_ms(volume: Volume, scan: ConeVec, algorithm: str) -> float | None:
-    """ASTRA's time with its data on the device, or None where `why_no_astra` says why."""
+    """Measure ASTRA's time with its data on the device; None where it is missing
+    (`why_no_astra`)."""
     try:
         prepared = Resident(volume, scan, PANEL, algorithm)
     except ImportError:
@@ -250,7 +282,13 @@ def astra_ms(volume: Volume, scan: ConeVec, algorithm: str) -> float | None:
 
 
 def bound(volume: Volume, scan: ConeVec) -> float | None:
-    """The least time [ms], or None where the device does not say how fast it is (the simulator)."""
+    """Compute the least possible time [ms]; None where the device's speed is unknown
+    (simulator).
+
+    Args:
+        volume: to read once.
+        scan: views; the voxels passed by a ray are counted for the first.
+    """
     from numba import config, cuda
 
     if config.ENABLE_CUDASIM:
@@ -269,7 +307,7 @@ def bound(volume: Volume, scan: ConeVec) -> float | None:
 
 
 def row(line: Document) -> str:
-    """A line of the page's table."""
+    """Format a line of the page's table."""
     value = "-" if line["measured"] is None else f"{line['measured']:.3g}"
     limits = f"{line['accepted']:.3g} | {line['wanted']:.3g}"
     why = f": {line['why']}" if "why" in line else ""
@@ -277,7 +315,7 @@ def row(line: Document) -> str:
 
 
 def page(document: Document) -> str:
-    """The document as one page of Markdown."""
+    """Format the document as one page of Markdown."""
     head = "| target | to be accepted | wanted | measured | met |\n|---|---|---|---|---|"
     lines = [f"# {document['device']}", "", head, *map(row, document["targets"]), ""]
     for name, seen in document["cases"].items():
@@ -289,7 +327,10 @@ def page(document: Document) -> str:
 def geometries(
     volume: Volume, cone_vec: ConeVec, shape: tuple[int, int]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """(volume geometry, projection geometry) as ASTRA's dictionaries. Safe without a GPU.
+    """Convert volume and views to ASTRA's dictionaries. Safe without a GPU.
+
+    Returns:
+        Volume geometry and projection geometry.
 
     ASTRA's z, y, x order is flexdt's; its volumes are centred where flexdt's are, in mm.
     """
@@ -325,6 +366,7 @@ class Resident:
         shape: tuple[int, int],
         algorithm: str = "FP3D_CUDA",
     ) -> None:
+        """Copy the volume to the device and prepare ASTRA's algorithm; see the class."""
         found = gpu.availability()
         if not found.present:
             raise GeometryError(f"ASTRA's 3D projector needs a GPU: {found.reason}")
@@ -359,7 +401,7 @@ class Resident:
 
 
 def _link(astra: Any, array: Any) -> Any:
-    """A contiguous array (z, y, x) on the device as ASTRA takes it."""
+    """Wrap a contiguous array (z, y, x) on the device for ASTRA."""
     z, y, x = array.shape
     pointer = array.device_ctypes_pointer.value
     return astra.pythonutils.GPULink(pointer, x, y, z, array.dtype.itemsize * x)

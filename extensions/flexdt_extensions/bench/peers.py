@@ -1,7 +1,7 @@
 """Other projectors, wrapped alike: prepared once, then timed call by call.
 
-A peer that is not installed says so and takes no part. Their
-geometry is flexdt's own cone_vec, translated here. No timing happens in this module.
+A peer that is not installed is listed as missing and takes no part. Their geometry is
+flexdt's own cone_vec, translated here. No timing happens in this module.
 """
 
 from __future__ import annotations
@@ -22,19 +22,20 @@ from flexdt_extensions.bench import rtk_peer as rtk
 
 
 class Runner(Protocol):
-    """A prepared projection: run it, then ask for the images."""
+    """A prepared projection: run it, then get the images."""
 
     @abstractmethod
     def run(self) -> float | None:
-        """Project; this is what is timed. Returns seconds where its own clock is the right one."""
+        """Run the projection, the timed part. Returns seconds where its own clock is
+        the right one."""
 
     @abstractmethod
     def images(self) -> Float32Array:
-        """Line integrals (n, rows, cols) of the last call."""
+        """Return the line integrals (n, rows, cols) of the last call."""
 
     @abstractmethod
     def close(self) -> None:
-        """Give back what was taken."""
+        """Release memory and processes."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class Peer:
     Attributes:
         name: on PyPI.
         missing: why it cannot take part, or None.
-        slow: a view takes tens of seconds: one call, and only where one view is asked for.
+        slow: a view takes tens of seconds: called once, and only for cases of one view.
         prepare: (volume, geometry, detector shape) to a runner.
     """
 
@@ -55,7 +56,7 @@ class Peer:
 
 
 def peers() -> list[Peer]:
-    """All peers this benchmark knows, installed or not."""
+    """List all peers this benchmark knows, installed or not."""
     return [
         Peer("itk-rtk", absent("itk-rtk"), False, joseph),
         Peer("diffdrr", absent("diffdrr"), True, DiffDrr),
@@ -63,7 +64,7 @@ def peers() -> list[Peer]:
 
 
 def absent(package: str) -> str | None:
-    """Why a package on PyPI cannot take part, or None."""
+    """Return why a package on PyPI cannot take part, or None."""
     # Asked of the installer: a look for the module itself would load itk into this process.
     try:
         metadata.distribution(package)
@@ -73,7 +74,8 @@ def absent(package: str) -> str | None:
 
 
 def joseph(volume: Volume, geometry: ConeVec, shape: tuple[int, int]) -> Runner:
-    """RTK's Joseph projector (its fastest on the CPU), in a process of its own."""
+    """Prepare RTK's Joseph projector (its fastest on the CPU), in a process of its
+    own."""
     data = np.asarray(volume.data)
     place = volume.voxel_xyz, volume.center_mm
     return rtk.Rtk(rtk.joseph, data, *place, geometry.rows, shape)
@@ -85,6 +87,13 @@ class DiffDrr:
     RAYS = 8192
 
     def __init__(self, volume: Volume, geometry: ConeVec, shape: tuple[int, int]) -> None:
+        """Copy the volume and the rays of all views to PyTorch.
+
+        Args:
+            volume: with attenuation [1/mm].
+            geometry: views.
+            shape: detector (rows, cols).
+        """
         import torch
         from diffdrr.renderers import Siddon
 
@@ -106,7 +115,7 @@ class DiffDrr:
         self._result = np.zeros(self._shape, np.float32)
 
     def run(self) -> None:
-        """See `Runner`."""
+        """Run the projection; see `Runner`."""
         import torch
 
         flat = self._result.reshape(self._shape[0], -1)
@@ -123,8 +132,8 @@ class DiffDrr:
                     flat[view, part] = image.numpy().reshape(-1)
 
     def images(self) -> Float32Array:
-        """See `Runner`."""
+        """Return the last images; see `Runner`."""
         return self._result
 
     def close(self) -> None:
-        """See `Runner`."""
+        """Do nothing; see `Runner`."""

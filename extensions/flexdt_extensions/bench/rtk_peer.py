@@ -21,7 +21,7 @@ import numpy as np
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 Work = tuple[Callable[[], None], Callable[[], Float32Array]]
-"""What is timed, and what gives its last result."""
+"""The call to time, and the function of its last result."""
 _T = TypeVar("_T")
 
 
@@ -45,7 +45,7 @@ class Rtk:
         return self._ask(_timed)
 
     def images(self) -> Float32Array:
-        """The last result."""
+        """Get the last result from the process."""
         return self._ask(_result)
 
     def close(self) -> None:
@@ -61,7 +61,7 @@ class Rtk:
 
 
 _PREPARED: list[Work] = []
-"""In the process: its piece of work."""
+"""Prepared work of this process, at most one."""
 
 
 def _prepare(build: Callable[..., Work], arguments: tuple[object, ...]) -> None:
@@ -92,7 +92,18 @@ def joseph(
     rows: FloatArray,
     shape: tuple[int, int],
 ) -> Work:
-    """RTK's Joseph projector, its fastest on the CPU, on our arrays and cone_vec rows."""
+    """Prepare RTK's Joseph projector, its fastest on the CPU.
+
+    Args:
+        data: volume (z, y, x).
+        voxel_mm: pitch (x, y, z).
+        center_mm: of the volume (x, y, z).
+        rows: cone_vec (n, 12).
+        shape: detector (rows, cols).
+
+    Returns:
+        The call to time, and the function of its images (n, rows, cols).
+    """
     import itk
     from itk import RTK as rtk
 
@@ -111,7 +122,11 @@ def joseph(
 
 
 def rtk_geometry(rows: FloatArray) -> Any:
-    """RTK's geometry object of cone_vec rows."""
+    """Convert cone_vec rows (n, 12) to RTK's geometry object.
+
+    Raises:
+        ValueError: RTK rejects a view.
+    """
     import itk
     from itk import RTK as rtk
 
@@ -130,7 +145,7 @@ def rtk_geometry(rows: FloatArray) -> Any:
 def rtk_volume(
     data: Float32Array, voxel_mm: tuple[float, float, float], center_mm: tuple[float, float, float]
 ) -> Any:
-    """A volume (z, y, x) as an ITK image in RTK's axes."""
+    """Convert a volume (z, y, x) to an ITK image in RTK's axes."""
     import itk
 
     image = itk.image_from_array(np.ascontiguousarray(data.transpose(1, 0, 2)[::-1]))

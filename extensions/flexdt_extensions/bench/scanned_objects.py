@@ -1,7 +1,9 @@
-"""What the benchmark's reconstructions are of: four kinds of images on an upright panel's circle.
+"""Objects of the benchmark's reconstructions: four kinds of images on an upright panel's
+circle.
 
-Zeros would leave out whatever depends on the object. Path lengths are closed forms: tall cylinders,
-whose chord depends on the column alone, times what a ray is longer than its horizontal part.
+Images of zeros would hide all costs that depend on the object. Path lengths are closed
+forms: tall cylinders, whose chord depends on the column alone, times the ratio of a ray's
+length to that of its horizontal part.
 """
 
 from __future__ import annotations
@@ -15,19 +17,19 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 ATTENUATION: Final = 0.02
-"""Of all objects [1/mm]."""
+"""Attenuation of all objects [1/mm]."""
 WHOLE: Final = 0.6
-"""Radius of an object that the panel sees whole, over that of the field of view."""
+"""Radius of a completely seen object, over that of the field of view."""
 WIDE: Final = 1.5
-"""The same of one that the panel cuts off."""
+"""Radius of an object that the panel cuts off, over that of the field of view."""
 ROD: Final = 0.1
 """Radius of the holder, whose axis is at the edge of the field of view, over its radius."""
 DRAWN: Final = 32
-"""Images of noise that are drawn; more views repeat them."""
+"""Number of noise images that are drawn; more views repeat them."""
 
 
 def field_mm(scan: ConeVec, shape: tuple[int, int]) -> float:
-    """Radius about the axis that each view of a circle sees, (rows, cols) [mm]."""
+    """Compute the radius about the axis that each view of a circle sees [mm]."""
     ends = (np.array([0.0, shape[1] - 1.0]) - (shape[1] - 1) / 2)[:, None]
     ray = (scan.detector[0] + ends * scan.u[0] - scan.source[0])[:, :2]
     source = scan.source[0, :2]
@@ -38,7 +40,7 @@ def field_mm(scan: ConeVec, shape: tuple[int, int]) -> float:
 def cylinders(
     scan: ConeVec, shape: tuple[int, int], parts: list[tuple[float, float]]
 ) -> Float32Array:
-    """Line integrals of upright cylinders, (n, rows, cols).
+    """Compute line integrals of upright cylinders, (n, rows, cols).
 
     Args:
         scan: a circle with upright panels.
@@ -59,7 +61,7 @@ def cylinders(
 
 
 def _longer(scan: ConeVec, shape: tuple[int, int]) -> FloatArray:
-    """Length of rays over that of their horizontal part, (rows, cols)."""
+    """Compute the length of rays over that of their horizontal part, (rows, cols)."""
     r, c = (np.arange(size) - (size - 1) / 2 for size in shape)
     ray = scan.detector[0] + c[None, :, None] * scan.u[0] + r[:, None, None] * scan.v[0]
     ray = ray - scan.source[0]
@@ -68,23 +70,25 @@ def _longer(scan: ConeVec, shape: tuple[int, int]) -> FloatArray:
 
 
 def whole(scan: ConeVec, shape: tuple[int, int]) -> Float32Array:
-    """Of an object that all views see whole."""
+    """Compute the images of an object that is complete in all views."""
     return cylinders(scan, shape, [(0.0, WHOLE * field_mm(scan, shape))])
 
 
 def cut_off(scan: ConeVec, shape: tuple[int, int]) -> Float32Array:
-    """Of an object that goes on beyond both sides of the panel in all views."""
+    """Compute the images of an object that extends beyond both sides of the panel in
+    all views."""
     return cylinders(scan, shape, [(0.0, WIDE * field_mm(scan, shape))])
 
 
 def holder(scan: ConeVec, shape: tuple[int, int]) -> Float32Array:
-    """Of an object that is seen whole, beside a rod that the panel's edge cuts in some views."""
+    """Compute the images of a complete object and a rod that the panel's edge cuts in
+    some views."""
     field = field_mm(scan, shape)
     return cylinders(scan, shape, [(0.0, WHOLE * field), (field, ROD * field)])
 
 
 def noise(scan: ConeVec, shape: tuple[int, int]) -> Float32Array:
-    """Of nothing: random numbers from 0 to 1."""
+    """Draw images of random numbers from 0 to 1."""
     drawn = np.random.default_rng(0).random((min(DRAWN, len(scan)), *shape), dtype=np.float32)
     return drawn[np.arange(len(scan)) % len(drawn)]
 
@@ -95,5 +99,5 @@ KINDS: Final[Mapping[str, Callable[[ConeVec, tuple[int, int]], Float32Array]]] =
     "holder": holder,
     "noise": noise,
 }
-"""Name -> line integrals (n, rows, cols) of a circle and a panel of (rows, cols). The first is what
-the others are compared with."""
+"""Name -> line integrals (n, rows, cols) of a circle and a panel of (rows, cols). The
+others are compared with the first."""
