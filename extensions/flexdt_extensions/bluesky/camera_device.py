@@ -1,14 +1,17 @@
-"""The camera as a detector: each trigger takes an image at the current pose into a TIFF file.
+"""The camera as a detector: each trigger takes an image at the current pose into a TIFF
+file.
 
-This process writes the files into the folder that an ophyd-async path provider names, and announces
-them as stream resources. For data sets that the twin itself writes, see `flyer`.
+This process writes the files into the folder that an ophyd-async path provider names, and
+announces them as stream resources. For data sets that the twin itself writes, see
+`flyer`.
 
-One image is in each file, and files are numbered. The documents follow bluesky's own convention for
-image sequences (mimetype `multipart/related;type=image/tiff`, a `template`, one frame in each
-chunk), so its consolidators and Tiled find the files.
+One image is in each file, and files are numbered. The documents follow bluesky's own
+convention for image sequences (mimetype `multipart/related;type=image/tiff`, a
+`template`, one frame in each chunk), so its consolidators and Tiled find the files.
 
-After a pause or a suspension the RunEngine triggers again what it had triggered since the last
-checkpoint, without a word to the detector. An image that no document names is then replaced.
+After a pause or a suspension the RunEngine repeats the triggers since the last
+checkpoint, without a word to the detector. An image that no document names is then
+replaced.
 """
 
 from __future__ import annotations
@@ -48,21 +51,23 @@ MIMETYPE: Final = "multipart/related;type=image/tiff"
 
 
 def folder_uri(folder: PurePath) -> str:
-    """The URI of a folder, with the slash at its end that relative names need."""
+    """Return the URI of a folder, with the slash at its end that relative names need."""
     return f"file://localhost{quote(folder.as_posix())}/"
 
 
 class Announcements(StreamResourceDataProvider):
-    """What announces files as they appear, and knows which of its documents were emitted.
+    """Announces files as they appear, and counts the emitted documents.
 
-    The RunEngine collects documents when it reads a detector and emits them with the event. If it
-    is interrupted in between, it drops them. It completes those that it emits, which shows here.
+    The RunEngine collects documents when it reads a detector and emits them with the
+    event. If it is interrupted in between, it drops them. It completes those that it
+    emits, which shows here.
     """
 
     _last: StreamDatum | None = None
 
     def count(self) -> int:
-        """How many events' images the emitted documents name; what was dropped is due again."""
+        """Count the events whose images the emitted documents name; dropped ones are
+        due again."""
         if self._last is not None and not self._last["descriptor"]:
             self.last_emitted, self._last = self._last["indices"]["start"], None
         return self.last_emitted
@@ -70,7 +75,7 @@ class Announcements(StreamResourceDataProvider):
     async def make_stream_docs(
         self, collections_written: int, collections_per_event: int
     ) -> AsyncIterator[StreamAsset]:
-        """Announce what has been written since."""
+        """Yield the documents of the images since the last call."""
         self.count()
         async for asset in super().make_stream_docs(collections_written, collections_per_event):
             if asset[0] == "stream_datum":
@@ -81,11 +86,11 @@ class Announcements(StreamResourceDataProvider):
 def tiff_stream(
     data_key: str, folder: PurePath, template: str, shape: tuple[int, int], written: SignalR[int]
 ) -> Announcements:
-    """What announces files as they appear.
+    """Make the provider that announces files as they appear.
 
     Args:
-        data_key: under which the images stand in a plan's data.
-        folder: that holds them, absolute.
+        data_key: name of the images in a plan's data.
+        folder: of the files, absolute.
         template: of their names: `scan_{:06d}.tif`.
         shape: (rows, columns) of an image.
         written: counts complete files.
@@ -112,7 +117,8 @@ class Roll:
         self.mean, self._set_mean = soft_signal_r_and_setter(float, 0.0)
         self.count = 0
         self.turn = asyncio.Lock()
-        """Held while a trigger takes its images: one that was interrupted goes on to its end."""
+        """Held while a trigger takes its images; an interrupted trigger continues to
+        its end."""
 
     def load(self, folder: PurePath, filename: str) -> None:
         """Begin a new series."""
@@ -122,7 +128,7 @@ class Roll:
         self.rewind(0)
 
     def rewind(self, count: int) -> None:
-        """Keep that many images; the next replaces what came after."""
+        """Keep that many images; the next one replaces the one after them."""
         self.count = count
         self._set_written(count)
 
@@ -156,7 +162,7 @@ class _Triggering(DetectorTriggerLogic):
 
 
 class _Acquiring(DetectorAcquireLogic):
-    """The task that takes the images; its failure reaches whoever triggered."""
+    """The task that takes the images; its failure reaches the caller of the trigger."""
 
     def __init__(self, link: LabConnection, triggering: _Triggering, roll: Roll) -> None:
         self.link, self.triggering, self.roll = link, triggering, roll
@@ -222,6 +228,13 @@ class TwinCamera(ReadBeforeDescribed, StandardDetector):
     """
 
     def __init__(self, link: LabConnection, where: PathProvider, name: str = "") -> None:
+        """Make the settings as signals and join the detector's parts.
+
+        Args:
+            link: to the twin.
+            where: gives folder and names of the files.
+            name: of the device.
+        """
         client = link.client
         self.exposure_ms = settable(
             link, "camera.exposure_ms", float, lambda v: client.set_camera(exposure_ms=v), "ms"
@@ -245,7 +258,7 @@ class TwinCamera(ReadBeforeDescribed, StandardDetector):
         self.add_config_signals(self.averages, self.mode, self.roi)
 
     def stage(self) -> AsyncStatus[None]:
-        """Be ready for a new run."""
+        """Prepare for a new run."""
         self._staging = super().stage()
         return self._staging
 

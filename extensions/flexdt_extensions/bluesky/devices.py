@@ -1,12 +1,12 @@
-"""The whole laboratory as one device: axes by name, tube, camera, flyer, over one connection.
+"""The laboratory as one device: axes by name, tube, camera, flyer, over one connection.
 
 Voltage, power and on or off of the X-ray tube are settable signals; `bps.mv(tube.kV, 90,
 tube.power_W, 20, tube.on, True)` waits until X-rays are stable.
 
-An axis is readable, movable, stoppable, and checked before anything moves. `check_value` judges a
-target by the machine's limits and by the twin's own plan of the path, so
-`bluesky.simulators.check_limits` and every `set` report what the scanner would reject. Positions
-have the script's sign, in mm and deg.
+An axis is readable, movable, stoppable, and checked before anything moves. `check_value`
+judges a target by the machine's limits and by the twin's own plan of the path, so
+`bluesky.simulators.check_limits` and every `set` report a target that the scanner would
+reject. Positions have the script's sign, in mm and deg.
 """
 
 from __future__ import annotations
@@ -68,8 +68,11 @@ class AxisLogic(MovableLogic[float]):
     async def check_move(self, new_position: float) -> None:
         """Check a move from the current position to a target; nothing moves.
 
+        Args:
+            new_position: target [mm, deg].
+
         Raises:
-            LimitsExceeded: says which limit, or which two parts would touch.
+            LimitsExceeded: names the limit, or the two parts that would touch.
         """
         state = await self.link.fresh()
         axis = state.axes[self.axis]
@@ -124,10 +127,10 @@ class TwinAxis(ReadBeforeDescribed, StandardReadable, StandardMovable[float]):
 
     Args:
         link: to the twin.
-        axis: as the machine calls it, e.g. `rot_obj`.
+        axis: name in the machine, e.g. `rot_obj`.
         unit: mm or deg.
         name: of the device; a plan's data carry it.
-        collisions: whether `check_value` asks the twin about collisions too (some 50 ms each).
+        collisions: whether `check_value` checks for collisions too (some 50 ms each).
     """
 
     def __init__(
@@ -139,6 +142,7 @@ class TwinAxis(ReadBeforeDescribed, StandardReadable, StandardMovable[float]):
         *,
         collisions: bool = True,
     ) -> None:
+        """Make position, speed and acceleration of the axis as signals; see the class."""
         self._link, self._axis, self._collisions = link, axis, collisions
         client = link.client
 
@@ -165,7 +169,7 @@ class TwinAxis(ReadBeforeDescribed, StandardReadable, StandardMovable[float]):
         return super().set(new_position, *more, **options)
 
     async def locate(self) -> Location[float]:
-        """Target and position, from the newest state that is known.
+        """Return target and position from the newest known state.
 
         Nothing is awaited while the twin's states arrive: Bluesky loses the answer to a message
         that is interrupted, and its relative plans then take the axis to be at 0.
@@ -192,6 +196,12 @@ class TwinTube(ReadBeforeDescribed, StandardReadable):
     """
 
     def __init__(self, link: LabConnection, name: str = "") -> None:
+        """Make voltage, power and the switch of X-rays as signals.
+
+        Args:
+            link: to the twin.
+            name: of the device.
+        """
         client = link.client
 
         async def switch(on: bool) -> None:
@@ -214,17 +224,18 @@ class TwinTube(ReadBeforeDescribed, StandardReadable):
 class TwinLab(Device, AsyncStageable):
     """A twin's devices.
 
-    Each axis of the machine is an attribute: `lab.rot_obj`, `lab.mag_obj`, ... Plans stage the root
-    of a device, which is the laboratory: it stages its camera and its flyer, so that each run
-    begins a series of images of its own.
+    Each axis of the machine is an attribute: `lab.rot_obj`, `lab.mag_obj`, ... Plans
+    stage the root of a device, which is the laboratory: it stages its camera and its
+    flyer, so that each run begins a series of images of its own.
 
     Args:
         where: names folder and file of the camera's images.
         host, port, token, ssl: of the twin server.
-        transport: replaces TCP, such as that of a twin in process (`flexdt.testing.twin`).
-        machine: whose axes there are; a shipped name or a value.
+        transport: replaces TCP, such as that of a twin in process
+            (`flexdt.testing.twin`).
+        machine: with the axes; a shipped name or a value.
         name: of the device.
-        collisions: whether `check_value` asks the twin about collisions too.
+        collisions: whether `check_value` checks for collisions too.
     """
 
     def __init__(
@@ -252,7 +263,7 @@ class TwinLab(Device, AsyncStageable):
         super().__init__(name=name)
 
     def axis(self, name: str) -> TwinAxis:
-        """An axis by its name.
+        """Return an axis by its name.
 
         Raises:
             KeyError: the machine has none of that name; lists them.
@@ -270,7 +281,7 @@ class TwinLab(Device, AsyncStageable):
 
     @AsyncStatus.wrap
     async def unstage(self) -> None:
-        """End what camera and flyer still do; a scan that has not ended is aborted."""
+        """End the work of camera and flyer; a scan that has not ended is aborted."""
         await asyncio.gather(self.camera.unstage(), self.scan.unstage())
 
     async def close(self) -> None:

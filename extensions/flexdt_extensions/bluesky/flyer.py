@@ -53,7 +53,7 @@ from flexdt_extensions.bluesky.lab_connection import LabConnection, LimitsExceed
 
 @dataclass(frozen=True)
 class FlyScan:
-    """What a flyer is prepared for.
+    """Scan that a flyer is prepared for.
 
     Attributes:
         script: a request that the script is composed from, or a script's text or bytes.
@@ -83,9 +83,10 @@ class _Prepared:
 
 
 class FrameEvents(Device, EventCollectable):
-    """Where each image of a fly scan was taken: an event an image, in the order of the images.
+    """Pose of each image of a fly scan: one event an image, in the order of the images.
 
-    Streams of images have no events of their own, so `fly_scan` collects these in a stream beside.
+    Streams of images have no events of their own, so `fly_scan` collects these in a
+    second stream.
     """
 
     def __init__(self, flyer: TwinFlyer) -> None:
@@ -94,7 +95,8 @@ class FrameEvents(Device, EventCollectable):
         super().__init__()
 
     async def describe_collect(self) -> dict[str, DataKey]:
-        """Angle of the stage in the middle of the image, and the planned start of its exposure."""
+        """Describe an event: angle of the stage in mid-exposure, and planned start of
+        the exposure."""
         flyer = self._flyer()
         source = flyer.source("script.check")
         return {
@@ -105,7 +107,7 @@ class FrameEvents(Device, EventCollectable):
         }
 
     def collect(self) -> Iterator[PartialEvent]:
-        """One event for each image that is complete."""
+        """Yield one event for each complete image."""
         flyer = self._flyer()
         name = flyer.name
         for angle, start in flyer.taken():
@@ -129,8 +131,8 @@ class TwinFlyer(
 
     Args:
         link: to the twin.
-        name: of the device; the images stand under it in a plan's data.
-        machine, profile: what scripts are composed and planned for; the server's, if they ship.
+        name: of the device and of its images in a plan's data.
+        machine, profile: for composing and planning scripts; the server's, if they ship.
     """
 
     def __init__(
@@ -167,10 +169,13 @@ class TwinFlyer(
 
     @AsyncStatus.wrap
     async def prepare(self, value: FlyScan) -> None:
-        """Check a scan whole; nothing moves.
+        """Check a complete scan; nothing moves.
+
+        Args:
+            value: the scan; it is kept for `kickoff`.
 
         Raises:
-            LimitsExceeded: the twin would not run it; says the lines.
+            LimitsExceeded: the twin would not run it; lists the lines.
             TwinError: the request cannot be composed, or the images are not one series.
         """
         async with self._submitting:
@@ -189,7 +194,7 @@ class TwinFlyer(
 
     @AsyncStatus.wrap
     async def kickoff(self) -> None:
-        """Submit the job."""
+        """Start the scan: submit its job."""
         ready = self._ready()
         client, scan = self._link.client, ready.scan
         async with self._submitting:
@@ -204,7 +209,10 @@ class TwinFlyer(
 
     @WatchableAsyncStatus.wrap
     async def complete(self) -> AsyncIterator[WatcherUpdate[int]]:
-        """Follow the job to its end.
+        """Wait for the job's end.
+
+        Yields:
+            Progress: frames done and in all, time remaining [s].
 
         Raises:
             RuntimeError: it did not end well; its data set is marked incomplete.
@@ -262,7 +270,7 @@ class TwinFlyer(
     # -- documents -----------------------------------------------------------------------------
 
     async def describe_collect(self) -> dict[str, DataKey]:
-        """The images."""
+        """Describe the images."""
         ready = self._ready()
         return {
             self.name: DataKey(
@@ -272,22 +280,23 @@ class TwinFlyer(
         }  # fmt: skip
 
     def source(self, method: str) -> str:
-        """Where values of a method of the twin come from."""
+        """Return the address of values of a method of the twin."""
         return f"flexdt://{self._link.address}/{method}"
 
     def taken(self) -> Iterator[tuple[float, float]]:
-        """Angle [deg] and planned start [s of the scan's clock] of the images that are complete."""
+        """Yield angle [deg] and planned start [s of the scan's clock] of each complete
+        image."""
         ready = self._ready()
         done = 0 if self.job is None else self.job.frames_done
         yield from list(zip(ready.angles_deg, ready.times_s, strict=True))[:done]
 
     async def get_index(self) -> int:
-        """Frames that are complete."""
+        """Count the complete frames."""
         written: int = await self._written.get_value()
         return written
 
     async def collect_asset_docs(self, index: int | None = None) -> AsyncIterator[StreamAsset]:
-        """Announce the files up to `index`."""
+        """Yield the documents of the files up to `index`."""
         if self._images is None:
             return
         count = await self.get_index() if index is None else index
@@ -295,7 +304,7 @@ class TwinFlyer(
             yield document
 
     async def describe_configuration(self) -> dict[str, DataKey]:
-        """What `read_configuration` reads."""
+        """Describe the values of `read_configuration`."""
         source, keys = self.source("script.check"), dict[str, DataKey]()
         for name, (value, dtype, numpy, units) in self._settings().items():
             shape: list[int | None] = [len(value)] if isinstance(value, list) else []
@@ -304,7 +313,8 @@ class TwinFlyer(
         return keys
 
     async def read_configuration(self) -> dict[str, Reading[Any]]:
-        """The scan: frames, exposure, expected duration, angle of each image, script."""
+        """Read the scan: frames, exposure, expected duration, angle of each image,
+        script."""
         now = time.time()
         return {
             f"{self.name}-{name}": Reading(value=setting[0], timestamp=now)
@@ -312,7 +322,7 @@ class TwinFlyer(
         }
 
     def _settings(self) -> dict[str, tuple[Any, Dtype, str, str | None]]:
-        """Value, type and unit by name."""
+        """Return value, type, NumPy's type and unit by name."""
         ready = self._ready()
         return {
             "frames": (ready.report.frames, "integer", "<i8", None),
@@ -345,6 +355,21 @@ class TwinFlyer(
 def _planned(
     scan: FlyScan, text: bytes, report: CheckResult, machine: Machine, profile: Profile
 ) -> _Prepared:
+    """Plan a script and check that its projections are one numbered series.
+
+    Args:
+        scan: of the flyer.
+        text: the script.
+        report: the twin's check of it.
+        machine, profile: to plan it with.
+
+    Returns:
+        The scan with shape, file template, angles [deg] and start times [s] of its
+        images.
+
+    Raises:
+        TwinError: images that are not one series numbered from 0.
+    """
     plan = plan_script(parse_script(text), machine, profile)
     images = [e for e in plan.exposures if e.kind == "projection"]
     names = [e.file for e in images]
@@ -378,22 +403,22 @@ def _refused(report: CheckResult) -> LimitsExceeded:
 
 STREAM = "primary"
 FRAMES = "frames"
-"""Stream of a fly scan's events: where each image was taken."""
+"""Stream of a fly scan's events: pose of each image."""
 
 
 def fly_scan(
     flyer: TwinFlyer, scan: FlyScan, *, md: Mapping[str, Any] | None = None, flush_s: float = 0.5
 ) -> MsgGenerator[str]:
-    """One smooth scan as a run; its images are announced while it goes on.
+    """Run one smooth scan; its images are announced while it goes on.
 
-    The stream `frames` then has an event for each image with the stage's angle, in their order,
-    also where the scan did not end well.
+    The stream `frames` then has an event for each image with the stage's angle, in their
+    order, also where the scan did not end well.
 
     Args:
         flyer: `lab.scan`.
-        scan: what to do.
+        scan: to run.
         md: for the start document.
-        flush_s: real seconds between announcements.
+        flush_s: interval between announcements [real s].
 
     Returns:
         The run's uid.
@@ -433,9 +458,11 @@ def fly_scan(
 
 
 def checkpoint_before_close(plan: MsgGenerator[Any]) -> MsgGenerator[Any]:
-    """For `RunEngine.preprocessors`: after a run's end an interruption repeats nothing of it.
+    """Set a checkpoint before each run's end, so that a later interruption repeats
+    nothing of it.
 
-    The RunEngine sets no checkpoint when a run ends, and would measure the last point once more.
+    For `RunEngine.preprocessors`. The RunEngine sets none itself, and would measure the
+    last point again.
     """
 
     def close(message: Msg) -> tuple[MsgGenerator[Any] | None, None]:
@@ -449,9 +476,12 @@ def checkpoint_before_close(plan: MsgGenerator[Any]) -> MsgGenerator[Any]:
 
 
 def _done(status: Any, seconds: float | None = None) -> MsgGenerator[bool]:
-    """Wait for a status, at most so long, or until an interruption; whether it is done.
+    """Wait for a status, at most so long, or until an interruption.
 
-    `bps.wait` cannot be repeated: what it waits for is forgotten when it is interrupted.
+    `bps.wait` cannot be repeated: its status is forgotten when it is interrupted.
+
+    Returns:
+        Whether the status is done.
     """
     if status is None:
         return True

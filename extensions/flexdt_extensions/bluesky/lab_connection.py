@@ -27,20 +27,21 @@ from flexdt.clients.client.client import AsyncTwinClient
 Watcher = Callable[[State], None]
 
 RATE_HZ = 20.0
-"""At most this many states per second reach a watcher."""
+"""Largest rate of states that reach a watcher [1/s]."""
 
 PATIENCE_S = 0.1
-"""How long to wait for an event before the state is requested."""
+"""Longest wait for an event before the state is requested [s]."""
 
 AT_EXIT_S = 2.0
-"""How long Python's end waits for a silent server."""
+"""Longest wait for a silent server at Python's end [s]."""
 
 
 class LimitsExceeded(ValueError):
-    """A target that the machine does not allow: beyond a limit, or in collision on the way.
+    """A target that the machine does not allow: beyond a limit, or in collision on the
+    way.
 
     Attributes:
-        data: what was asked and what is allowed.
+        data: the rejected and the allowed values.
     """
 
     def __init__(self, message: str, data: dict[str, object]) -> None:
@@ -107,7 +108,7 @@ class LabConnection:
         await self.client.close()
 
     def _end_at_exit(self) -> None:
-        """End a connection that nobody closed, while RunEngine's loop still runs in its thread.
+        """Close a connection left open, while RunEngine's loop still runs in its thread.
 
         Python's end would destroy its waiting tasks, each with lines on standard error.
         """
@@ -118,7 +119,7 @@ class LabConnection:
             ending.result(AT_EXIT_S)
 
     async def fresh(self) -> State:
-        """Request the present state."""
+        """Get the present state; listen again if the connection was lost for too long."""
         state = await self.client.state()
         self._take(state)
         if self._pump is not None and self._pump.done():  # the twin was gone for too long
@@ -126,7 +127,8 @@ class LabConnection:
         return state
 
     async def known(self) -> State:
-        """The newest state that has arrived; requested where states do not arrive any more."""
+        """Return the newest state that has arrived; request it where states no longer
+        arrive."""
         if self.state is None or self._pump is None or self._pump.done():
             return await self.fresh()
         return self.state
@@ -144,7 +146,7 @@ class LabConnection:
         return end
 
     async def states(self) -> AsyncIterator[State]:
-        """Fresh states: one at once, then one after every change of the twin."""
+        """Yield fresh states: one at once, then one after every change of the twin."""
         while True:
             self._news.clear()
             yield await self.fresh()
@@ -169,16 +171,16 @@ class LabConnection:
 
 
 class ReadBeforeDescribed(AsyncConfigurable):
-    """A device whose configuration is read whole before it is described.
+    """A device whose configuration is read completely before it is described.
 
-    Bluesky asks for both at once and takes what has been described for read, also where it was
-    interrupted in between.
+    Bluesky starts both at once and takes a described value for a read one, even if an
+    interruption came in between.
     """
 
     async def describe_configuration(self) -> dict[str, DataKey]:
-        """What `read_configuration` reads."""
+        """Describe the values of `read_configuration`, after reading them."""
         described = await super().describe_configuration()  # type: ignore[safe-super]
-        await self.read_configuration()  # answered after what was asked at the same time
+        await self.read_configuration()  # after a description started earlier
         return described
 
 
@@ -205,7 +207,7 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
         path: the value's place in the state: `axes.rot_obj.position`.
         datatype: of the value.
         put: request another value.
-        get: the value, from a state, where it is not what is at `path`.
+        get: the value, from a state, where it is not the one at `path`.
         units: of the value.
         limits: lowest and highest value, from a state.
     """
@@ -226,14 +228,14 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
         self._end: Callable[[], None] | None = None
 
     def _member(self, state: State) -> _T:
-        """What is at `path`; zero where that is not known."""
+        """Get the value at `path`; zero where that is not known."""
         value: Any = state
         for name in self._path.split("."):
             value = value[name] if isinstance(value, Mapping) else getattr(value, name)
         return cast(_T, cast(type[Any], self.datatype)() if value is None else value)
 
     def source(self, name: str, read: bool) -> str:
-        """Where the value comes from."""
+        """Return the address of the value."""
         return f"flexdt://{self._link.address}/{self._path}"
 
     async def connect(self, timeout: float) -> None:
@@ -259,7 +261,7 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
         await self._link.fresh()
 
     async def get_datakey(self, source: str) -> DataKey:
-        """Type, unit and limits."""
+        """Describe type, unit and limits."""
         dtype, dtype_numpy = DTYPES[cast(type[Value], self.datatype)]
         key = DataKey(dtype=dtype, shape=[], source=source, dtype_numpy=dtype_numpy)
         if self._units is not None:
@@ -270,11 +272,11 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
         return key
 
     async def get_reading(self) -> Reading[_T]:
-        """The value now."""
+        """Get the value now, as a reading."""
         return _reading(await self.get_value())
 
     async def get_value(self) -> _T:
-        """The value now."""
+        """Get the value now."""
         return self._get(await self._link.fresh())
 
     get_setpoint = get_value
@@ -310,5 +312,5 @@ def settable(
     units: str | None = None,
     get: Get[_T] | None = None,
 ) -> SignalRW[_T]:
-    """A signal to read and set; arguments as those of `TwinBackend`."""
+    """Make a signal to read and set; arguments as those of `TwinBackend`."""
     return SignalRW(TwinBackend(link, path, datatype, put, units, get))
