@@ -1,1 +1,2 @@
-"""CTSimU scenarios to images: what is asked (`ctsimu_scan`), and the images (`scenario`)."""
+"""CTSimU scenarios to images: read the scenario (`ctsimu_scan`), make its images
+(`scenario`)."""

@@ -20,7 +20,7 @@ from flexdt.twin.exchange import ExchangeError, ScanGeometry, cone_vec_of, read_
 from flexdt.twin.geometry.conventions import FloatArray, rotation_about
 
 MOST: Final = 1_000_000
-"""Frames, rows and columns."""
+"""Largest number of frames, rows and columns."""
 MAX_MINOR: Final = 2
 MM: Final = {"mm": 1.0, "m": 1000.0, "cm": 10.0, "dm": 100.0, "um": 1e-3, "nm": 1e-6}
 _RAD: Final = {"rad": 1.0, "deg": math.pi / 180.0}
@@ -36,7 +36,7 @@ _AXES: Final = {
 Pose = tuple[FloatArray, ...]
 """Source, panel's centre, u, v; centre and axes of the stage; all in the world."""
 Beside = Callable[[str], str]
-"""Text of a file that the scenario names."""
+"""Text of a file by its name in the scenario."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ class PerFrame:
     real: FloatArray
 
     def of(self, real: bool) -> FloatArray:
-        """One of the two."""
+        """Return the real or the known values."""
         return self.real if real else self.known
 
 
@@ -74,21 +74,24 @@ class PlacedPart:
 
 
 def read_ctsimu(text: str, file: str = "<scenario>", beside: Beside | None = None) -> ScanGeometry:
-    """The geometry of a scenario: `cone_vec` as reconstruction knows it, `real` where it differs.
+    """Read the geometry of a scenario: `cone_vec` as reconstruction knows it, `real`
+    where it differs.
 
     Args:
         text: the scenario.
         file: its name, for errors.
-        beside: gives the text of a file of drifts that it names; without it such drifts are errors.
+        beside: returns the text of a file of drifts by its name; without it such drifts
+            are errors.
 
     Raises:
-        ExchangeError: names file, key and what is allowed.
+        ExchangeError: names file, key and the allowed values.
     """
     return ScenarioReader(read_json(text, file), file, beside).geometry()
 
 
 class ScenarioReader:
-    """What the geometry of a scenario says; `beside` gives the text of a file that it names."""
+    """Reads the geometry of a scenario; `beside` returns the text of a file by its
+    name."""
 
     def __init__(
         self, document: Mapping[str, Any], file: str, beside: Beside | None = None
@@ -98,7 +101,15 @@ class ScenarioReader:
         self._count = self._size("acquisition", "number_of_projections")
 
     def geometry(self) -> ScanGeometry:
-        """The geometry of its frames."""
+        """Compute the geometry of the scenario's frames, known and real.
+
+        Returns:
+            Views of the binned pixels in the stage's frame; a note where known and real
+            differ.
+
+        Raises:
+            ExchangeError: names file, key and the allowed values.
+        """
         source_type = self._at("geometry", "source").get("type", "cone")
         if source_type not in (None, "cone"):
             raise self._error("geometry.source.type", "cone")
@@ -126,7 +137,10 @@ class ScenarioReader:
         )
 
     def _bins(self, rows: int, cols: int) -> tuple[int, int]:
-        """Pixels to bin along u and v; what fills no binned pixel is cut off on both sides."""
+        """Read the numbers of pixels to bin along u and v.
+
+        Pixels that fill no binned pixel are cut off on both sides.
+        """
         where = "acquisition.pixel_binning"
         binning = self._at("acquisition").get("pixel_binning")
         if binning is None:
@@ -150,7 +164,7 @@ class ScenarioReader:
         return out
 
     def _angles(self) -> FloatArray:
-        """The stage's turn about its w, [rad] per frame."""
+        """Compute the stage's turn about its w, [rad] per frame."""
         acquisition = self._at("acquisition")
         start = self._number(("acquisition", "start_angle"), _RAD)
         stop = self._number(("acquisition", "stop_angle"), _RAD)
@@ -168,7 +182,20 @@ class ScenarioReader:
         return self._placed(self._at("geometry", name), f"geometry.{name}", (WORLD,))
 
     def _placed(self, part: Mapping[str, Any], where: str, allowed: tuple[str, ...]) -> PlacedPart:
-        """Source, detector, stage (u, w) or sample (r, t), in one of the `allowed` references."""
+        """Read source, detector, stage (u, w) or sample (r, t), in one of the `allowed`
+        references.
+
+        Args:
+            part: its object in the scenario.
+            where: its place, for errors.
+            allowed: references, each the names of three axes.
+
+        Returns:
+            Centre [mm], axes, drifts of the centre and deviations.
+
+        Raises:
+            ExchangeError: names file, key and the allowed values.
+        """
         if part.get("deviation") or part.get("centre"):
             raise self._error(where, "the form of file format 1.0 and later (center, deviations)")
         center = part.get("center")
@@ -202,6 +229,15 @@ class ScenarioReader:
         )  # fmt: skip
 
     def _deviation(self, value: object, where: str) -> _Deviation:
+        """Read a deviation: a translation [mm] or a rotation [rad] about a pivot.
+
+        Args:
+            value: its object in the scenario.
+            where: its place, for errors.
+
+        Raises:
+            ExchangeError: names file, key and the allowed values.
+        """
         if not isinstance(value, dict) or value.get("type") not in ("translation", "rotation"):
             raise self._error(where, "an object with type translation or rotation")
         turn = value["type"] == "rotation"
@@ -237,7 +273,16 @@ class ScenarioReader:
         raise self._error(where, "three components x, y, z or u, v, w")
 
     def _frames(self, value: object, where: str, units: Mapping[Any, float]) -> PerFrame:
-        """A parameter with its drifts at every frame."""
+        """Read a parameter with its drifts at every frame.
+
+        Args:
+            value: number, or object with value, unit and drifts.
+            where: its place, for errors.
+            units: unit -> factor.
+
+        Returns:
+            Known and real values, (n,) each.
+        """
         standard = self._value(value, where, units)
         known = np.full(self._count, standard)
         real = known.copy()
@@ -263,7 +308,17 @@ class ScenarioReader:
         return PerFrame(known, real)
 
     def _numbers(self, name: object, where: str, columns: int = 1) -> FloatArray:
-        """At least so many columns of numbers, separated by commas or blanks, in a named file."""
+        """Read at least so many columns of numbers, separated by commas or blanks, in a
+        named file.
+
+        Args:
+            name: of the file.
+            where: its place in the scenario, for errors.
+            columns: least number.
+
+        Returns:
+            (lines, columns).
+        """
         if not isinstance(name, str) or self._beside is None:
             raise self._error(where, "values in this file, as no other is read here")
         lines = [line.replace(",", " ").split() for line in self._beside(name).splitlines()]
@@ -341,7 +396,8 @@ class ScenarioReader:
 
 
 def seen_from(pose: Pose, center: FloatArray, axes: FloatArray) -> FloatArray:
-    """The cone_vec row (12,) of a pose in another frame, whose centre and axes are the world's."""
+    """Convert a pose to a cone_vec row (12,) in another frame, whose centre and axes
+    are the world's."""
     source, detector, u, v = pose[:4]
     return np.concatenate([axes.T @ x for x in (source - center, detector - center, u, v)])
 
@@ -353,9 +409,16 @@ def place(
     real: bool,
     stage: tuple[FloatArray, FloatArray] | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Centre (3,) and axes as columns (3, 3) of a part in one frame.
+    """Compute centre (3,) and axes as columns (3, 3) of a part in one frame.
 
-    In the world, or, for a sample on the stage, in the stage's (u, v, w); `stage` is where that is.
+    In the world, or, for a sample on the stage, in the stage's (u, v, w).
+
+    Args:
+        part: centre, axes, deviations and drifts.
+        turn: (n,) of the part about its w [rad].
+        frame: number of the frame.
+        real: include deviations unknown to reconstruction.
+        stage: centre and axes of the stage, for a sample.
     """
     center, axes = part.center.copy(), part.axes
     if turn[frame] != 0.0:
@@ -392,7 +455,8 @@ def _orthonormal(u: FloatArray, w: FloatArray) -> FloatArray | None:
 
 
 def _interpolated(values: FloatArray, count: int) -> FloatArray:
-    """Drift values over the frames: the first at the first frame, the last at the last."""
+    """Fit drift values to the frames: the first at the first frame, the last at the
+    last."""
     if len(values) == 1 or count == 1:
         return np.full(count, values[0])
     if len(values) == count:
@@ -402,7 +466,7 @@ def _interpolated(values: FloatArray, count: int) -> FloatArray:
 
 
 def drifts_of(value: object) -> list[Any]:
-    """The drifts of a parameter."""
+    """List the drifts of a parameter."""
     found = value.get("drifts") if isinstance(value, dict) else None
     if found is None and isinstance(value, dict):
         found = value.get("drift")

@@ -1,7 +1,7 @@
-"""A CTSimU scenario to all that a simulation needs: geometry, samples, tube, detector, scan.
+"""A CTSimU scenario to all data of a simulation: geometry, samples, tube, detector, scan.
 
-What a scenario asks and the simulation cannot do is an error that names its place; what it says and
-nothing here looks at becomes a note. Nothing is ignored in silence.
+A request of the scenario that cannot be simulated is an error that names its place;
+values that are not used become notes. Nothing is ignored in silence.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ _WORDS: Final = frozenset(
      "endian", "gain", "headersize", "id", "known_to_reconstruction", "manufacturer", "model",
      "name", "scan_mode", "scan_speed", "temperature", "type", "uncertainty", "unit", "version")
 )  # fmt: skip
-"""Keys that change no image here, or only beside another one that is looked at."""
+"""Keys that change no image here, or only in combination with one that is read."""
 _STILL: Final = 1e-9
-"""Changes of place [mm] and direction that count as none."""
+"""Changes of place [mm] and direction that count as zero."""
 DUPLEX_WIRE: Final = 0.69
-"""Standard deviation of a Gaussian over its basic spatial resolution: two bars as far apart as they
-are wide show a dip of 20 % (ASTM E2597)."""
+"""Standard deviation of a Gaussian over its basic spatial resolution: two bars at a
+distance of their width show a dip of 20 % (ASTM E2597)."""
 T = TypeVar("T")
 D = TypeVar("D", float, None)
 
@@ -57,11 +57,13 @@ class MeshSample:
 
     Attributes:
         where: its place in the scenario, for errors.
-        file: the surface, as the scenario names it; the middle of its box is the sample's origin.
+        file: name of the surface in the scenario; the middle of its box is the sample's
+            origin.
         scale_mm: millimetres for each unit of the file, along r, s, t.
-        substance: what fills it.
+        substance: filling.
         views: (n, 12) cone_vec rows of the unbinned pixels in the sample's r, s, t [mm].
-        on_stage: centre (3,) and axes as columns (3, 3) in the stage's frame; None if it moves.
+        on_stage: centre (3,) and axes as columns (3, 3) in the stage's frame; None if it
+            moves.
     """
 
     where: str
@@ -115,24 +117,26 @@ class GreyValues:
 
 @dataclass(frozen=True, eq=False)
 class ScenarioScan:
-    """What a scenario says about its images.
+    """Data of a scenario's images.
 
     Attributes:
         geometry: of the binned pixels, as reconstruction knows it and as it is.
-        views: (n, 12) cone_vec rows of the unbinned pixels as they are, in the stage's frame [mm].
-        shape, binning: unbinned pixels that are used, and how many are binned, (rows, cols) each.
+        views: (n, 12) cone_vec rows of the unbinned pixels as they are, in the stage's
+            frame [mm].
+        shape, binning: unbinned pixels that are used, and how many are binned, (rows,
+            cols) each.
         samples: the objects.
-        environment: what fills the space between; None for vacuum.
+        environment: substance of the space between; None for vacuum.
         spectra: photons of each energy per cm2 and mAs at 1 m behind the tube's filters.
-        spectrum_of: (n,) which of them a projection is made with.
+        spectrum_of: (n,) index into `spectra` of each projection.
         mAs: (n,) charge of one frame [mAs].
         spot_mm: standard deviations of the focal spot along the panel's u and v.
         response: (e,) energy that a photon leaves in the detector on average [keV].
-        grey: what the detector makes of it.
+        grey: the detector's conversion of energy to grey values.
         averages: frames in a projection.
-        dark, flat: images beside the projections.
+        dark, flat: reference images.
         scattering: whether scatter is simulated.
-        notes: what is doubtful, and what nothing here looks at.
+        notes: doubts, and values that are not used.
     """
 
     geometry: ScanGeometry
@@ -155,21 +159,21 @@ class ScenarioScan:
 
 
 def read_scenario(text: str, file: str, beside: Beside) -> ScenarioScan:
-    """All that a scenario says about its images.
+    """Read all data of a scenario's images.
 
     Args:
         text: the scenario, JSON.
         file: its name, for errors.
-        beside: the text of a file that it names: drifts, spectrum, characteristics.
+        beside: returns the text of a file by its name: drifts, spectrum, characteristics.
 
     Raises:
-        ExchangeError: names file, key and what is allowed.
+        ExchangeError: names file, key and the allowed values.
     """
     return _ScanReader(read_json(text, file, _Watched), file, beside).scan()
 
 
 class _Watched(dict[str, Any]):
-    """A JSON object that knows which of its keys somebody has looked at."""
+    """A JSON object that records which of its keys were read."""
 
     def __init__(self, *given: Any) -> None:
         super().__init__(*given)
@@ -184,7 +188,7 @@ class _Watched(dict[str, Any]):
         return super().__getitem__(key)
 
     def unseen(self, where: str = "") -> Iterator[str]:
-        """Places of values that nobody has looked at."""
+        """Yield the places of values that were not read."""
         for key, value in self.items():
             at = f"{where}.{key}".lstrip(".")
             if key not in self.seen and key not in _WORDS and _says_something(value):
@@ -203,6 +207,14 @@ def _says_something(value: object) -> bool:
 
 class _ScanReader(ScenarioReader):
     def scan(self) -> ScenarioScan:
+        """Read the scenario: samples, spectra, currents, detector and references.
+
+        Returns:
+            The scan; its notes list values that are not used.
+
+        Raises:
+            ExchangeError: names file, key and the allowed values.
+        """
         self._notes: list[str] = []
         size = [self._size("detector", name) for name in ("rows", "columns")]
         bins = self._bins(*size)[::-1]
@@ -243,6 +255,19 @@ class _ScanReader(ScenarioReader):
     # Geometry
 
     def _sample(self, given: object, where: str, poses: list[Pose]) -> MeshSample | None:
+        """Read a sample: mesh, scale, substance and place in every frame.
+
+        Args:
+            given: its object in the scenario.
+            where: its place, for errors.
+            poses: of source, panel and stage, one for each frame.
+
+        Returns:
+            The sample; None for vacuum, with a note.
+
+        Raises:
+            ExchangeError: names file, key and the allowed values.
+        """
         if not isinstance(given, dict) or not isinstance(given.get("position"), dict):
             raise self._error(where, "an object with file, unit, material_id and position")
         name = self._text(given.get("file"), f"{where}.file")
@@ -282,6 +307,18 @@ class _ScanReader(ScenarioReader):
     # Materials
 
     def _material_of(self, given: object, where: str) -> tuple[str, Substance | None]:
+        """Read a material: density and mass fractions of its elements.
+
+        Args:
+            given: its object in the scenario.
+            where: its place, for errors.
+
+        Returns:
+            Its id, and the substance; None for vacuum.
+
+        Raises:
+            ExchangeError: names file, key and the allowed values.
+        """
         if not isinstance(given, dict) or not isinstance(given.get("id"), str):
             raise self._error(where, "an object with id, density and composition")
         density = self._plain(given.get("density"), _G_CM3, f"{where}.density", 0.0)
@@ -303,7 +340,7 @@ class _ScanReader(ScenarioReader):
         return given["id"], self._tried(where, Substance, given["id"], shares, density)
 
     def _material(self, name: object, where: str) -> Substance | None:
-        """None for vacuum."""
+        """Return the substance of a material's id; None for vacuum."""
         if name is None:
             return None
         if not isinstance(name, str) or name not in self._substances:
@@ -316,7 +353,7 @@ class _ScanReader(ScenarioReader):
         return tuple(layer for layer in found if layer is not None)
 
     def _layer(self, given: object, where: str) -> Filter | None:
-        """A thickness of a material; None for vacuum."""
+        """Read a thickness of a material; None for vacuum."""
         if not isinstance(given, dict):
             raise self._error(where, "an object with material_id and thickness")
         substance = self._material(given.get("material_id"), f"{where}.material_id")
@@ -328,7 +365,15 @@ class _ScanReader(ScenarioReader):
     # Tube
 
     def _spectra(self) -> tuple[tuple[FloatArray, ...], tuple[int, ...]]:
-        """Photons per cm2 and mAs at 1 m of each spectrum that occurs, and which each frame has."""
+        """Compute the spectra behind the filters.
+
+        Returns:
+            Photons per cm2 and mAs at 1 m of each spectrum that occurs, and the index of
+            each frame's.
+
+        Raises:
+            ExchangeError: names file, key and the allowed values.
+        """
         at = "source.spectrum"
         single = self._flag("source", "spectrum", "monochromatic")
         files = self._texts(self._given("source", "spectrum", "file"), f"{at}.file")
@@ -336,7 +381,7 @@ class _ScanReader(ScenarioReader):
         if any(files):
             keys: list[Any] = [self._text(name, f"{at}.file") for name in files]
             made = {name: self._tabulated(name, f"{at}.file") for name in dict.fromkeys(keys)}
-            for name in ("voltage", "target", "window"):  # what made the file's spectrum
+            for name in ("voltage", "target", "window"):  # tube settings of the file's spectrum
                 self._at("source").get(name)
         else:
             keys = self._series(_KV, "source", "voltage").tolist()
@@ -365,7 +410,15 @@ class _ScanReader(ScenarioReader):
         )
 
     def _tabulated(self, name: object, where: str) -> Spectrum:
-        """The spectrum of a file, photons / (s sr mA) about each energy, in the tables' bins."""
+        """Read the spectrum of a file into the tables' bins.
+
+        Args:
+            name: of the file: energy [keV] and photons / (s sr mA) about it.
+            where: its place in the scenario, for errors.
+
+        Returns:
+            Photons per cm2 and mAs at 1 m.
+        """
         energy, photons = self._numbers(name, where, 2).T
         if len(energy) < 2 or np.diff(energy).min() <= 0.0 or photons.min() < 0.0:
             raise self._error(where, "two or more growing energies, photons of 0 or more")
@@ -383,7 +436,11 @@ class _ScanReader(ScenarioReader):
         return Spectrum(amount * 1e-4)  # a cm2 at 1 m is 1e-4 sr
 
     def _spot(self) -> tuple[float, float]:
-        """Standard deviations along u and v: a Gaussian that ends with the spot, or all of it."""
+        """Compute the focal spot's standard deviations along u and v [mm].
+
+        Returns:
+            Those of a Gaussian that ends with the spot, or of a complete one.
+        """
         where = ("source", "spot")
         self._nothing(*where, "intensity_map", "file")
         found = []
@@ -403,7 +460,11 @@ class _ScanReader(ScenarioReader):
     # Detector
 
     def _response(self) -> FloatArray:
-        """Energy that a photon leaves in the detector, (e,) [keV]."""
+        """Compute the energy that a photon leaves in the detector on average.
+
+        Returns:
+            (e,) [keV] at the tables' energies, behind the detector's filters and window.
+        """
         energy = tables().energy_keV
         kind = self._text(self._given("detector", "type"), "detector.type")
         if kind not in (None, "ideal", "real"):
@@ -426,6 +487,14 @@ class _ScanReader(ScenarioReader):
         return part * energy * Spectrum(np.ones_like(energy)).behind(*layers).fluence
 
     def _grey(self) -> GreyValues:
+        """Read the detector's grey values, noise, blur, lag and bits.
+
+        Returns:
+            The conversion from energy to grey values.
+
+        Raises:
+            ExchangeError: names file, key and the allowed values.
+        """
         at = ("detector", "gray_value")
         single = self._flag("source", "spectrum", "monochromatic")
         table = self._table(2, *at, "intensity_characteristics_file")
@@ -477,7 +546,7 @@ class _ScanReader(ScenarioReader):
     # Values
 
     def _given(self, *path: str) -> Any:
-        """What stands at a place; None where it or what holds it is missing or null."""
+        """Return the value at a place; None where it or its object is missing or null."""
         found: Any = self._document
         for i, key in enumerate(path):
             if not isinstance(found, dict):
@@ -507,7 +576,7 @@ class _ScanReader(ScenarioReader):
         return value
 
     def _nothing(self, *path: str) -> None:
-        """What cannot be simulated must not be asked for."""
+        """Check that a file that cannot be simulated is not given."""
         if any(self._texts(self._given(*path), ".".join(path))):
             raise self._error(".".join(path), "null; such files are not read")
 
@@ -518,7 +587,8 @@ class _ScanReader(ScenarioReader):
         return value or None
 
     def _texts(self, given: object, where: str) -> list[str | None]:
-        """A text for each frame; one stays until the next one's frame is reached."""
+        """Return a text for each frame; a drift's text holds until the next one's
+        frame."""
         drifts = drifts_of(given)
         if not drifts:
             return [self._text(given, where)] * self._count
@@ -533,7 +603,7 @@ class _ScanReader(ScenarioReader):
         return [self._text(names[i * (len(names) - 1) // steps], where) for i in range(self._count)]
 
     def _table(self, columns: int, *path: str) -> FloatArray | None:
-        """The numbers of a file that stands at a place, by growing first column."""
+        """Read the numbers of the file named at a place, by growing first column."""
         where = ".".join(path)
         name = self._text(self._given(*path), where)
         if name is None:
@@ -546,7 +616,7 @@ class _ScanReader(ScenarioReader):
     def _plain(
         self, given: object, units: Mapping[Any, float], where: str, default: D
     ) -> float | D:
-        """A number that does not drift."""
+        """Read a number that does not drift."""
         if given is None or (isinstance(given, dict) and given.get("value") is None):
             if drifts_of(given):
                 raise self._error(where, "a value where there are drifts")
@@ -562,7 +632,7 @@ class _ScanReader(ScenarioReader):
     def _series(
         self, units: Mapping[Any, float], *path: str, default: float | None = None
     ) -> FloatArray:
-        """A positive number for each frame."""
+        """Read a positive number for each frame."""
         where, given = ".".join(path), self._given(*path)
         value = given.get("value") if isinstance(given, dict) else given
         if value is None and default is not None:
@@ -585,7 +655,7 @@ def _fractions(formula: str) -> Mapping[str, float]:
 
 
 def _line(energy_keV: float) -> Spectrum:
-    """Photons of one energy, shared by the two bins about it."""
+    """Make photons of one energy, shared by the two bins about it."""
     bins = tables().energy_keV
     low = monochromatic(energy_keV)
     at = int(low.fluence.argmax())

@@ -28,13 +28,13 @@ FORMAT: Final = {"major": 1, "minor": 2}
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """What a scenario is made from.
+    """Data of a scenario to write.
 
     Attributes:
         poses: nominal, of the projections.
         shape: detector (rows, cols), binned.
         known: the correction in force, which a reconstruction knows.
-        real: what is so; None: as known.
+        real: true offsets; None: as known.
         name, description, date: for people; date as YYYY-MM-DD.
         kV, power_W: of the tube.
         exposure_s: of one exposure.
@@ -67,12 +67,16 @@ class Scenario:
 def scenario_of(
     dataset: DataSet, parameters: Offsets | None = None, real: Offsets | None = None
 ) -> dict[str, Any]:
-    """A data set as a CTSimU scenario.
+    """Convert a data set to a CTSimU scenario.
 
     Args:
         dataset: from `load_dataset`.
         parameters: correction, known to reconstruction; None is the one in force, if any.
-        real: what is so, unknown to reconstruction where it differs; None: as `parameters`.
+        real: true offsets, unknown to reconstruction where they differ; None: as
+            `parameters`.
+
+    Returns:
+        The scenario's JSON object.
     """
     if parameters is None:
         parameters = NOMINAL if dataset.correction is None else dataset.correction.parameters
@@ -101,7 +105,14 @@ def scenario_of(
 
 
 def scenario_document(scan: Scenario) -> dict[str, Any]:
-    """The scenario as a JSON object.
+    """Make the scenario's JSON object.
+
+    Args:
+        scan: its data.
+
+    Returns:
+        Tables of file format 1.2: file, geometry, detector, source, acquisition, and so
+        on.
 
     Raises:
         ExchangeError: a panel that turns or changes during the scan.
@@ -193,8 +204,10 @@ def scenario_document(scan: Scenario) -> dict[str, Any]:
 
 
 def _stage_motion(angles_deg: FloatArray) -> tuple[float, float, str, list[dict[str, Any]]]:
-    """The stage's start and stop angle [deg] and direction; what is not in equal steps is a drift
-    of a turn about its own axis."""
+    """Determine the stage's start and stop angle [deg], direction and drifts.
+
+    Deviations from equal steps become a drift of a turn about the stage's own axis.
+    """
     first, last = float(angles_deg[0]), float(angles_deg[-1])
     forward = first <= last
     start, stop = (first, last) if forward else (-first, -last)
@@ -211,13 +224,13 @@ _SOURCE: Final = "-y dS_x, z dS_y"
 _DETECTOR: Final = "-y dD_x, z dD_y, x dD_z, v det_yaw, u det_pitch, w det_roll"
 _STAGE: Final = ("-y dO_x, z dO_y, x dO_z, -y tau_x, x tau_z", "-w alpha")
 _OBJECT: Final = "-y axis_tilt_x, x axis_tilt_z, -u tau_x, -v tau_z"
-"""Along or about which axis of the scenario each parameter acts, in their order. A tilt is about
-our +x, which is the scenario's -y, then about our +y, its +x; the object's own frame lies tau
-beside the axis it turns about."""
+"""Axis of the scenario along or about which each parameter acts, in their order. A
+tilt is about our +x, which is the scenario's -y, then about our +y, its +x; the
+object's own frame is offset by tau from the axis it turns about."""
 
 
 class _Deviations:
-    """Deviations of all parameters: the known amount, then what is added to it unknown."""
+    """Deviations of all parameters: the known amount, then the unknown addition to it."""
 
     def __init__(self, known: Offsets, real: Offsets) -> None:
         self._known, self._real = known.to_edge(), real.to_edge()
@@ -234,7 +247,7 @@ class _Deviations:
                 if a != 0.0]  # fmt: skip
 
     def of(self, parameters: str) -> list[dict[str, Any]]:
-        """The deviations of a table of axes and parameters."""
+        """List the deviations of a table of axes and parameters."""
         out = []
         for axis, name in (pair.split() for pair in parameters.split(", ")):
             turn, sign = UNITS[name] == "deg", -1.0 if axis.startswith("-") else 1.0
@@ -257,7 +270,7 @@ def _deviation(
 
 
 def _drifting_turn(turns_deg: FloatArray, known: bool, comment: str) -> dict[str, Any]:
-    """A turn about the stage's w that differs from frame to frame."""
+    """Make a turn about the stage's w that differs from frame to frame."""
     amount = _deg(0.0) | {"drifts": [_drift(turns_deg, "deg", known)]}
     return _deviation("rotation", "w", amount, known, comment)
 
@@ -269,7 +282,13 @@ def _drift(values: FloatArray, unit: str, known: bool) -> dict[str, Any]:
 def _part(
     places: FloatArray, u: FloatArray, w: FloatArray, deviations: list[dict[str, Any]]
 ) -> dict[str, Any]:
-    """Centre (with drifts where it moves), orientation, deviations."""
+    """Make a part's object: centre (with drifts where it moves), orientation, deviations.
+
+    Args:
+        places: (n, 3) of its centre in our world [mm].
+        u, w: directions (3,) in the scenario's world.
+        deviations: of `_Deviations`.
+    """
     at = places @ TO_CTSIMU.T
     center: dict[str, Any] = {}
     for i, axis in enumerate("xyz"):

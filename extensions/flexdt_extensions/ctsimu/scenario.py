@@ -1,8 +1,9 @@
-"""A CTSimU scenario to its images: `flexdt simulate`, and `flexdt.simulate(SCENARIO)` in Python.
+"""A CTSimU scenario to its images: `flexdt simulate`, and `flexdt.simulate(SCENARIO)` in
+Python.
 
-`ctsimu_scan` says what is asked; exact paths through the samples' meshes, the
-spectrum, scatter and blur are those of `flexdt.simulate`. Only what a detector makes of the energy
-it collects is stated otherwise: a scenario gives grey values and a signal-to-noise ratio.
+`ctsimu_scan` reads the scenario; exact paths through the samples' meshes, the spectrum,
+scatter and blur are those of `flexdt.simulate`. Only the detector's conversion of
+collected energy differs: a scenario gives grey values and a signal-to-noise ratio.
 """
 
 from __future__ import annotations
@@ -55,15 +56,16 @@ FORMAT: Final = {"major": 1, "minor": 2}
 
 
 class ScenarioImages:
-    """The images of a scenario, each computed when it is asked for.
+    """The images of a scenario, each computed on access.
 
     Args:
-        path: the scenario; files that it names lie beside it.
+        path: the scenario; the files that it names are in its folder.
         seed: of the noise, >= 0; None for images without noise.
         rays: along each side of a pixel; their signals are averaged.
 
     Raises:
-        ExchangeError, TwinError: what the scenario asks and is not possible, and where.
+        ExchangeError, TwinError: a request of the scenario that is not possible, and its
+            place.
         OSError: a file cannot be read.
     """
 
@@ -107,7 +109,7 @@ class ScenarioImages:
         return [effective_beam(s, s * self.scan.response, substances, thick) for s in signals]
 
     def _distance(self, frame: int) -> Float32Array:
-        """From the source to each pixel, (rows, cols) [mm]."""
+        """Compute the distance from the source to each pixel, (rows, cols) [mm]."""
         row, (rows, cols) = self.scan.views[frame], self.scan.shape
         v = np.arange(rows)[:, None, None] - (rows - 1) / 2
         u = np.arange(cols)[None, :, None] - (cols - 1) / 2
@@ -126,7 +128,16 @@ class ScenarioImages:
         return out
 
     def _collected(self, frame: int, samples: bool = True) -> tuple[Float32Array, Float32Array]:
-        """Energy in each pixel of one frame [keV], and its variance, before the detector blurs."""
+        """Compute the energy in each pixel of one frame, and its variance, before the
+        detector blurs.
+
+        Args:
+            frame: number of the frame.
+            samples: with the samples; False is the open beam.
+
+        Returns:
+            Mean [keV] and variance [keV^2], (rows, cols) each.
+        """
         scan, n = self.scan, self._rays if samples else 1
         beam = self._beams[scan.spectrum_of[frame]]
         # In double precision: rays that meet nothing then average to the open beam's very value.
@@ -147,6 +158,8 @@ class ScenarioImages:
 
     @cached_property
     def _scatter(self) -> ScanScatter | None:
+        """Scatter of all frames by the samples on the stage; None where it is not
+        simulated."""
         scan = self.scan
         if not scan.scattering or not scan.samples:
             return None
@@ -192,6 +205,14 @@ class ScenarioImages:
         return np.asarray(values, dtype=np.float32)
 
     def _blurred(self, image: Float32Array) -> Float32Array:
+        """Apply the detector's blur, a Gaussian or the file's MTF.
+
+        Args:
+            image: (rows, cols), unbinned.
+
+        Returns:
+            The blurred image; a Gaussian leaves out the pixel's own width.
+        """
         grey, view = self.scan.grey, self.scan.views[0]
         u, v = (float(np.linalg.norm(view[i : i + 3])) for i in (6, 9))
         if grey.mtf is None:
@@ -210,7 +231,13 @@ class ScenarioImages:
     def _read_out(
         self, energy: Float32Array, variance: Float32Array, averages: int, noise: int | None
     ) -> FloatArray:
-        """Grey values of the binned pixels; `noise` is the image's number, None for none."""
+        """Compute the grey values of the binned pixels.
+
+        Args:
+            energy, variance: (rows, cols), unbinned.
+            averages: frames in the image.
+            noise: the image's number, for its random numbers; None for no noise.
+        """
         grey = self.scan.grey
         values = self._grey(self._blurred(energy))
         if noise is not None and self._seed is not None:
@@ -241,16 +268,20 @@ class ScenarioImages:
         return len(self.scan.views)
 
     def darks(self) -> list[Counts]:
-        """Dark images, uint16 (rows, cols)."""
+        """Compute the dark images, uint16 (rows, cols)."""
         return [self._counts(one) for one in self._references(self.scan.dark, False, 0)]
 
     def flats(self) -> list[Counts]:
-        """Flat images, uint16 (rows, cols)."""
+        """Compute the flat images, uint16 (rows, cols)."""
         first = self.scan.dark.number
         return [self._counts(one) for one in self._references(self.scan.flat, True, first)]
 
     def projections(self) -> Iterator[Counts]:
-        """Projections, uint16 (rows, cols); corrected, if the scenario says so."""
+        """Yield the projections in order.
+
+        Yields:
+            uint16 (rows, cols); corrected by dark and flat where the scenario has it.
+        """
         scan, lag = self.scan, self.scan.grey.lag
         dark = np.mean(self.darks(), axis=0) if scan.dark.correction else 0.0
         gain = None
@@ -261,7 +292,7 @@ class ScenarioImages:
         for i in range(len(self)):
             energy, variance = self._collected(i)
             if lag > 0.0:
-                # Each frame keeps the part `lag` of what the last one showed.
+                # Each frame keeps the part `lag` of the previous one.
                 left = np.zeros_like(energy) if before is None else before - energy
                 n = scan.averages
                 before = energy + left * np.float32(lag**n)
@@ -273,7 +304,8 @@ class ScenarioImages:
         return np.clip(np.rint(values), 0.0, 2.0**self.scan.grey.bits - 1.0).astype(np.uint16)
 
     def dataset(self) -> DataSet:
-        """All images as a data set in memory, with the geometry that reconstruction knows.
+        """Collect all images in a data set in memory, with the geometry that
+        reconstruction knows.
 
         Without dark or flat images in the scenario the data set has none either.
         """
@@ -334,6 +366,12 @@ class ScenarioImages:
         return folder / f"{stem}_metadata.json"
 
     def _metadata(self, folder: Path, names: dict[str, str | None]) -> dict[str, Any]:
+        """Make CTSimU's metadata of the written images.
+
+        Args:
+            folder: of the images.
+            names: file pattern of dark and flat images; None for none.
+        """
         own = Path(os.path.relpath(self.path.absolute(), folder)).as_posix()
         scan, today = self.scan, datetime.now(UTC).date().isoformat()
         rows, cols = scan.geometry.shape or (0, 0)
@@ -385,10 +423,10 @@ class ScenarioImages:
 
 
 def _made_of(substance: Substance) -> Material:
-    """For the scatter's grid, which asks nothing but the substance."""
+    """Wrap a substance for the scatter's grid, which needs nothing else."""
     return Material(substance.name, "", substance.density_g_cm3, 0.0, (), "", substance.fractions)
 
 
 def dataset(path: str | os.PathLike[str], seed: int | None, rays: int) -> DataSet:
-    """What `flexdt.simulate` gives of a scenario; see `ScenarioImages`."""
+    """Simulate a scenario for `flexdt.simulate`; see `ScenarioImages`."""
     return ScenarioImages(path, seed, rays).dataset()
