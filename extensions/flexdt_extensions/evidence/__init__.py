@@ -1,1 +1,1 @@
-"""Real, public data that nobody of this project made, against their published answers."""
+"""Real, public data from outside this project, compared with their published answers."""

@@ -1,4 +1,5 @@
-"""`flexdt evidence`: what flexdt makes of real, public data, beside what was published of them."""
+"""`flexdt evidence`: flexdt's results on real, public data, compared with the
+published ones."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Real data, what was published of them, and what flexdt makes of them.
+"""Real data, their published answers, and flexdt's.
 
-Nothing of the data is in the repository: their licences are their own. Each case names its files
-below the folder that `flexdt evidence --data` is given, and where they come from.
+Nothing of the data is in the repository: their licences are their own. Each case names
+its files below the folder of `flexdt evidence --data`, and their origin.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ Array = npt.NDArray[np.floating[Any]]
 
 @dataclass(frozen=True)
 class Figure:
-    """One published answer beside ours.
+    """One published answer and ours.
 
     Attributes:
-        what: was compared.
+        what: compared quantity.
         published, ours: in words or numbers.
-        agrees: whether ours is as near as is asked for.
+        agrees: whether ours is within the tolerance.
     """
 
     what: str
@@ -43,7 +43,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class NotRead:
-    """Data that could not be read, which says nothing of flexdt's answers.
+    """Data that could not be read; they are no evidence of flexdt's answers.
 
     Attributes:
         what: file or reader.
@@ -73,15 +73,16 @@ class Case:
     compare: Callable[[list[Path]], Iterator[Told]]
 
     def told(self, files: list[Path]) -> Iterator[Told]:
-        """The figures of these files; what ends them is told as well and raised by nothing."""
+        """Compare these files and yield the figures; an error is a figure as well and
+        not raised."""
         return _guarded(lambda: self.compare(files), self.files)
 
 
 def _guarded(make: Callable[[], Iterator[Told]], what: str) -> Iterator[Told]:
-    """What `make` tells, and then what ended it.
+    """Yield the figures of `make`, and an error at its end as one more.
 
-    An error out of flexdt is a missed figure. A reader that is not installed, and whatever other
-    packages raise for a file of another form than its name says, is `NotRead`.
+    An error out of flexdt is a missed figure. A reader that is not installed, and any
+    error of other packages for a file that is not of its name's format, is `NotRead`.
     """
     try:
         yield from make()
@@ -120,7 +121,7 @@ class _Numbers(pickle.Unpickler):
 
 
 def _numbers(file: Path) -> Any:
-    """What CaTE stores: one pickled dictionary in a NumPy file."""
+    """Load CaTE's form of storage: one pickled dictionary in a NumPy file."""
     with file.open("rb") as stream:
         np.lib.format.read_magic(stream)
         np.lib.format.read_array_header_1_0(stream)
@@ -128,7 +129,8 @@ def _numbers(file: Path) -> Any:
 
 
 def _calibrated(seen: Any, frames: Any, start: fx.ConeVec, *free: str) -> tuple[Any, Array]:
-    """The report of a calibration by CaTE's marks, and the markers' places (k, 3) [mm]."""
+    """Fit the geometry to CaTE's marks; returns the report and the markers' places (k,
+    3) [mm]."""
     marks = [
         (k, str(name), float(column), float(row), None)
         for k, frame in enumerate(frames)
@@ -144,18 +146,31 @@ def _calibrated(seen: Any, frames: Any, start: fx.ConeVec, *free: str) -> tuple[
 VIEWS: Final[Mapping[str, int]] = {"pos_2": 3600, "pert_0": 24, "pert_2": 14, "pert_2++": 24}
 """CaTE's scans of 25 September 2020 -> views of a turn."""
 SHIFT_MM: Final = -758.0
-"""From the SDD of 1098 mm that CaTE starts with."""
+"""Shift of the detector [mm], against the SDD of 1098 mm that CaTE starts with."""
 APART_MM: Final = 0.1
 SCALE: Final = 0.003
-"""How far markers may be apart between scans, and how unlike in size: marks of three to ten views
-know the SDD to 0.4 % at best."""
+"""Largest distance of markers between scans, and of their sizes' ratio from 1: marks
+of three to ten views determine the SDD to 0.4 % at best."""
 
 
 def needles(files: list[Path]) -> Iterator[Told]:
-    """CaTE: marks in radiographs of the FleX-ray itself, of objects of unknown shape."""
+    """Compare CaTE: marks in radiographs of the FleX-ray itself, of objects of unknown
+    shape.
+
+    Args:
+        files: of marks, one for each scan.
+
+    Yields:
+        Shift of the detector and residual of each scan; markers of each pair.
+    """
     shapes: dict[str, Array] = {}
 
     def of_scan(file: Path) -> Iterator[Told]:
+        """Calibrate one scan and compare the detector's shift and the residual.
+
+        Args:
+            file: of its marks.
+        """
         scan = file.name.removeprefix("needle_25Sep2020_").removesuffix("_locations.npy")
         if scan not in VIEWS:
             yield NotRead(file.name, f"views of a turn are known for {', '.join(VIEWS)}")
@@ -184,8 +199,12 @@ def needles(files: list[Path]) -> Iterator[Told]:
 
 
 def _apart(one: Array, other: Array) -> tuple[float, float]:
-    """Root mean square distance of points (k, 3) after the best turn, shift and scale, and the
-    second's size in the first's, which the two scans' SDD tell to a few tenths of a per cent.
+    """Compare two sets of points (k, 3) after the best turn, shift and scale.
+
+    Returns:
+        Root mean square distance, and the second's size over the first's, which the two
+        scans' SDD
+        determine to a few tenths of a per cent.
     """
     from scipy.spatial import procrustes
 
@@ -195,11 +214,20 @@ def _apart(one: Array, other: Array) -> tuple[float, float]:
 
 DELFT: Final = "Calibration_needle_phantom_30degsec_table474mm"
 PITCH: Final = (302 / 1524, 307 / 1548)
-"""Of the pixels of Delft's panels [mm], as its script has them."""
+"""Pitch of the pixels of Delft's panels [mm], as its script has them."""
 
 
 def delft(files: list[Path]) -> Iterator[Told]:
-    """Three sources about one stage: each calibrated on its own, then how they stand."""
+    """Compare three sources about one stage: each calibrated on its own, then their
+    arrangement.
+
+    Args:
+        files: of marks, one for each source.
+
+    Yields:
+        SDD, residual and axis of each source; markers, turn and magnification of each
+        pair.
+    """
     stored = _numbers(files[0].with_name(f"geom_pre_proc_{DELFT}_calibrated_on_26aug2021.npy"))
     found: list[tuple[Array, Any, complex, float]] = []
     for k, file in enumerate(files, 1):
@@ -215,7 +243,7 @@ def delft(files: list[Path]) -> Iterator[Told]:
         rms, (aside, up) = held["rms_px"], (held["parameters"][key] for key in ("dO_x", "dD_y"))
         yield Figure(f"{k}: residual", "hand-made marks", f"{rms:.2f} px rms", rms < 1.5)
         # Theirs are cm; columns grow to the left, seen from the source, and a panel's middle is at
-        # half their number: it is told as its mirror image.
+        # half their number: its mirror image is stored.
         source, panel = (10 * getattr(stored[k], name) for name in ("_source", "_detector"))
         here, there = complex(source[0], -source[1]), complex(panel[0], -panel[1])
         axis = (here * there.conjugate()).imag / abs(here) + 0.5 * PITCH[0]
@@ -239,7 +267,8 @@ def delft(files: list[Path]) -> Iterator[Told]:
 
 
 def _by_matrix(matrix: Array, shape: tuple[int, ...], pixel: float) -> fx.ConeVec:
-    """The geometry of a projection matrix (3, 4) to pixels whose third row is positive in front."""
+    """Convert a projection matrix (3, 4) to pixels, whose third row is positive in
+    front, to views."""
     rays = np.linalg.inv(matrix[:, :3])
     source = -rays @ matrix[:, 3]
     rays *= pixel / np.linalg.norm(rays[:, 0])
@@ -248,7 +277,8 @@ def _by_matrix(matrix: Array, shape: tuple[int, ...], pixel: float) -> fx.ConeVe
 
 
 def _across(view: fx.ConeVec, image: Array, normals: Array) -> Array:
-    """Grangeat's derivative of the object's integrals over planes (k, 3) through the source.
+    """Compute Grangeat's derivative of the object's integrals over planes (k, 3) through
+    the source.
 
     It is that of the integrals of the image, weighted by cosines, over the planes' lines, across
     those and over the squared cosine of the plane. Pixels are square.
@@ -270,7 +300,15 @@ def _across(view: fx.ConeVec, image: Array, normals: Array) -> Array:
 
 
 def c_arm(files: list[Path]) -> Iterator[Told]:
-    """Two views of a C-arm by their matrices: planes through both sources have one integral."""
+    """Compare two views of a C-arm by their matrices: planes through both sources have
+    one integral.
+
+    Args:
+        files: of the two images, with matrices.
+
+    Yields:
+        Points and planes, as stored and for a matrix shifted by 5 px.
+    """
     matrices, images, pixel = [], [], 1.0
     for file in files:
         head, _, raw = file.read_bytes().partition(b"\n\n")
@@ -300,10 +338,23 @@ def c_arm(files: list[Path]) -> Iterator[Told]:
 
 
 def helsinki(files: list[Path]) -> Iterator[Told]:
-    """HTC 2022: fan-beam sinograms beside the images that their authors published."""
+    """Compare HTC 2022: fan-beam reconstructions with the images that their authors
+    published.
+
+    Args:
+        files: of the sinograms.
+
+    Yields:
+        Correlation of each image.
+    """
     from scipy.io import loadmat
 
     def of_scan(file: Path) -> Iterator[Told]:
+        """Reconstruct one sinogram and compare it with the published image.
+
+        Args:
+            file: of the sinogram.
+        """
         name = file.name.removeprefix("htc2022_").removesuffix("_full.mat")
         published = file.with_name(f"{file.stem}_recon_fbp.mat")
         if not published.exists():
@@ -328,7 +379,7 @@ def helsinki(files: list[Path]) -> Iterator[Told]:
 
 
 def tooth(files: list[Path]) -> Iterator[Told]:
-    """Tomopy's tooth: half a turn in a parallel beam, which flexdt does not take."""
+    """Check Tomopy's tooth: half a turn in a parallel beam, which flexdt rejects."""
     h5py = package("h5py", "HDF5 files", "io")
     with h5py.File(files[0]) as stored:
         scan = stored["exchange"]
@@ -343,13 +394,13 @@ def tooth(files: list[Path]) -> Iterator[Told]:
 
 
 def zeiss(files: list[Path]) -> Iterator[Told]:
-    """Tomopy's scan of a chip in Zeiss's own format: a parallel beam, too."""
+    """Check Tomopy's scan of a chip in Zeiss's own format: a parallel beam, too."""
     said = _said(lambda: fx.open(files[0])).removeprefix(f"{files[0]}: ")
     yield Figure("open", "to be refused", said, "a parallel beam" in said)
 
 
 def _said(make: Callable[[], Any]) -> str:
-    """What flexdt makes, or why it does not."""
+    """Return flexdt's result as text, or its error."""
     try:
         return str(make())
     except fx.TwinError as error:
