@@ -30,7 +30,7 @@ ENVIRONMENTS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
     ),
     "flexdt/Reconstruction-v0": (f"{_HERE}.reconstructing:ReconstructionEnv", {}),
 }
-"""Registered id -> where the environment is and what it is given."""
+"""Registered id -> class of the environment and its arguments."""
 
 for _name, (_entry, _options) in ENVIRONMENTS.items():
     if _name not in gymnasium.registry:

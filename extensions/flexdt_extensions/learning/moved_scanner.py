@@ -1,7 +1,8 @@
-"""The scanner that an agent moves: kinematic time, collisions, dose, geometry of each frame.
+"""The scanner that an agent moves: kinematic time, collisions, dose, geometry of each
+frame.
 
-`ScannerTwin` with its collision guard and a clock of its own: time is what motors and exposures
-take, never wall-clock time.
+`ScannerTwin` with its collision guard and a clock of its own: time is that of motors and
+exposures, never wall-clock time.
 """
 
 from __future__ import annotations
@@ -25,14 +26,14 @@ from flexdt.twin.scanner.scanner import ScannerTwin
 
 REFERENCE_SOD_MM: Final = 600.0
 BINNING: Final = 32
-"""Detector pixels per coarse pixel of small images."""
+"""Number of detector pixels per coarse pixel of small images."""
 
 
 COUNTS: Final = ("frames", "attempts")
 
 
 def require_positive(*, or_zero: bool = False, **values: float) -> None:
-    """Check an environment's settings; `COUNTS` are whole numbers.
+    """Check an environment's settings; `COUNTS` are integers.
 
     Raises:
         LimitError: names the argument.
@@ -49,7 +50,8 @@ def require_positive(*, or_zero: bool = False, **values: float) -> None:
 
 
 def choices(action: npt.ArrayLike, sizes: Sequence[int]) -> list[int]:
-    """An action of whole numbers, one for each size and below it.
+    """Check an action of integers, one for each size and below it, and return it as a
+    list.
 
     Raises:
         LimitError: says what is allowed.
@@ -68,11 +70,11 @@ def choices(action: npt.ArrayLike, sizes: Sequence[int]) -> list[int]:
 
 @dataclass(frozen=True)
 class Taken:
-    """What one frame cost.
+    """Cost of one frame.
 
     Attributes:
-        seconds: of motion and exposure.
-        dose: exposure seconds at full tube power and SOD 600 mm that give the same.
+        seconds: of motion and exposure [s].
+        dose: exposure seconds at full tube power and SOD 600 mm of the same dose.
         collided: the motion ended before a contact; no frame was taken.
     """
 
@@ -112,12 +114,12 @@ class Lab:
         return rows // BINNING, cols // BINNING
 
     def range_of(self, axis: str) -> tuple[float, float]:
-        """Travel of a motor [mm, deg]."""
+        """Return the travel of a motor [mm, deg]."""
         a = self.machine.axes[axis]
         return a.lower, a.upper
 
     def position(self, axis: str) -> float:
-        """Position of a motor [mm, deg]."""
+        """Return the position of a motor [mm, deg]."""
         return self.scanner.positions(self.now)[axis]
 
     def take(self, targets: dict[str, float]) -> Taken:
@@ -134,7 +136,7 @@ class Lab:
         return Taken(self.now - start, dose, collided=False)
 
     def seconds_to(self, targets: dict[str, float]) -> float:
-        """What `take` would cost in time if nothing is in the way; nothing moves."""
+        """Compute the time of `take` without collisions [s]; nothing moves."""
         ends = [self.now]
         for axis, target in targets.items():
             here = self.position(axis)
@@ -145,10 +147,11 @@ class Lab:
         return max(ends) - self.now + self.exposure_s
 
     def poses(self, targets: dict[str, float] | None = None) -> Poses:
-        """Nominal pose where the motors stand, or would with some of them elsewhere."""
+        """Compute the nominal pose of the present positions, or with some motors
+        elsewhere."""
         positions = self.scanner.positions(self.now)
         return self.scanner.poses_at({**positions, **(targets or {})}, self.scanner.camera)
 
     def small(self, poses: Poses, at: Offsets) -> ConeVec:
-        """The coarse detector's geometry."""
+        """Compute the coarse detector's geometry."""
         return poses.cone_vec(at).binned(BINNING, self.shape)

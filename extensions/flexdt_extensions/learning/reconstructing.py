@@ -71,7 +71,16 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """A new object, number of views and dose; nothing reconstructed."""
+        """Start an episode: draw an object, number of views and dose; nothing
+        reconstructed.
+
+        Args:
+            seed: of the episode; None goes on with the present random numbers.
+            options: not used.
+
+        Returns:
+            Observation, and `quality`, `best` and `work`.
+        """
         super().reset(seed=seed)
         rng = self.np_random
         thing = random_object(rng)
@@ -91,7 +100,14 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
         return self._observe(), {"quality": 0.0, "best": 0.0, "work": 0.0}
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """One attempt.
+        """Run one attempt.
+
+        Args:
+            action: algorithm, strength, nonnegative; an index each.
+
+        Returns:
+            Observation, reward, whether the attempts are used up, False, and `quality`,
+            `best`, `work`.
 
         Raises:
             LimitError: no action of this environment.
@@ -121,7 +137,7 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
         return self._observe(), reward, self._left <= 0, False, info
 
     def render(self) -> npt.NDArray[np.uint8] | None:
-        """The middle slice of the last attempt."""
+        """Render the middle slice of the last attempt."""
         if self.render_mode is None:
             return None
         middle = self._volume.data[GRID // 2]
@@ -129,7 +145,16 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
         return np.repeat(np.kron(grey, np.ones((8, 8), np.uint8))[..., None], 3, axis=2)
 
     def _run(self, algorithm: int, strength: int, nonnegative: bool) -> tuple[Volume, float]:
-        """The volume of an attempt and its work in projections of all views."""
+        """Reconstruct by an algorithm.
+
+        Args:
+            algorithm: index into ALGORITHMS.
+            strength: index into windows or numbers of iterations.
+            nonnegative: set negative values to 0.
+
+        Returns:
+            The volume, and the work in projections of all views.
+        """
         assert self._cone is not None
         images, cone, like = self._images, self._cone, blank()
         match ALGORITHMS[algorithm]:
@@ -157,7 +182,7 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
 
 
 def _roughness(volume: Volume) -> float:
-    """Mean step between neighbouring voxels over the root mean square value, at most 1."""
+    """Compute the mean step between neighbouring voxels over the rms value, at most 1."""
     data = np.asarray(volume.data, np.float64)
     steps = np.mean([np.abs(np.diff(data, axis=a)).mean() for a in range(3)])
     return min(1.0, float(steps) / max(float(np.sqrt(np.mean(data**2))), 1e-12))

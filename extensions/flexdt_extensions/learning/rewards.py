@@ -1,6 +1,7 @@
-"""What an agent's frames are worth: information about the geometry, or a reconstruction.
+"""Values of an agent's frames: information about the geometry, or a reconstruction.
 
-A task knows the hidden truth, renders the detector's images and scores what each frame added.
+A task knows the hidden truth, renders the detector's images and scores the gain of each
+frame.
 """
 
 from __future__ import annotations
@@ -38,13 +39,14 @@ PRIOR: Final = 50.0
 """Standard deviation of every parameter before the first frame, in tolerances (10 mm, 10 deg)."""
 SIDE_MM: Final = 50.0
 GRID: Final = 20
-"""Voxels along each side of a reconstruction of SIDE_MM."""
+"""Number of voxels along each side of a reconstruction of SIDE_MM."""
 PHOTONS: Final = 2e4
 """Open-beam photons of a coarse pixel."""
 ITERATIONS: Final = 6
-"""Of SIRT, after each frame."""
+"""Number of SIRT iterations after each frame."""
 COARSE: Final = 10
-"""Columns along each side of the model that a planner's forecast of quality uses."""
+"""Number of columns along each side of the model that a planner's forecast of quality
+uses."""
 
 
 class InformationTask:
@@ -64,7 +66,7 @@ class InformationTask:
         self._information = np.eye(len(SIX)) / PRIOR**2
 
     def reset(self, lab: Lab, rng: np.random.Generator) -> None:
-        """Offsets of a few millimetres and degrees, nothing known."""
+        """Draw offsets of a few millimetres and degrees; only the prior is known."""
         shift = rng.normal(0.0, 2.0, 3)
         tau = rng.normal(0.0, 1.0, 2)
         self._truth = Offsets.from_edge(
@@ -76,32 +78,35 @@ class InformationTask:
         self._information = np.eye(len(SIX)) / PRIOR**2
 
     def add(self, lab: Lab, poses: Poses, rng: np.random.Generator) -> float:
-        """Take one frame; what it was worth."""
+        """Take one frame and return the information gained [nats]."""
         before = _log_det(self._information)
         self._information = self._information + self._of(lab, poses, self._truth)[0]
         return 0.5 * (_log_det(self._information) - before)
 
     def state(self) -> Float32Array:
-        """Logarithm of each sigma, -1 for a thousandth of its tolerance, +1 for the prior.
+        """Return the logarithm of each sigma: -1 for a thousandth of its tolerance, +1
+        for the prior.
 
-        Sigmas belong to the hidden geometry; an estimate's would differ from them by little.
+        Sigmas belong to the hidden geometry; an estimate's would differ from them by
+        little.
         """
         sigma = np.sqrt(np.diag(np.linalg.inv(self._information)))
         span = math.log10(PRIOR) + 3.0
         return np.asarray(np.clip(2.0 * (np.log10(sigma) + 3.0) / span - 1.0, -1, 1), np.float32)
 
     def show(self, lab: Lab, poses: Poses) -> Float32Array:
-        """Line integrals on the coarse detector, noise aside, (rows, cols)."""
+        """Compute line integrals on the coarse detector without noise, (rows, cols)."""
         cone = lab.small(poses, self._truth)
         return np.asarray(project_scene(self.phantom.scene, cone, lab.small_shape)[0])
 
     def forecast(self, lab: Lab, poses: Poses) -> FloatArray:
-        """Expected gain at the nominal geometry, given the information there is."""
+        """Compute the expected gain at the nominal geometry, given the information so
+        far."""
         more = self._information + self._of(lab, poses, NOMINAL)
         return np.array([0.5 * (_log_det(m) - _log_det(self._information)) for m in more])
 
     def info(self) -> dict[str, float]:
-        """Information so far and the worst sigma in tolerances."""
+        """Return information so far and the worst sigma in tolerances."""
         start = _log_det(np.eye(len(SIX)) / PRIOR**2)
         return {
             "information": 0.5 * (_log_det(self._information) - start),
@@ -109,7 +114,13 @@ class InformationTask:
         }
 
     def _of(self, lab: Lab, poses: Poses, at: Offsets) -> FloatArray:
-        """(n, p, p) information of each frame, parameters in tolerances."""
+        """Compute the information of each frame, (n, p, p), parameters in tolerances.
+
+        Args:
+            lab: its detector.
+            poses: n frames.
+            at: offsets.
+        """
         n, k = len(poses), len(self._model)
         sizes = np.broadcast_to(np.asarray(lab.shape, dtype=np.float64), (n, 2))
         problem = build_problem(
@@ -152,12 +163,19 @@ class QualityTask:
         self._residual = 1.0
 
     def reset(self, lab: Lab, rng: np.random.Generator) -> None:
-        """A new object."""
+        """Draw a new object."""
         phantom = self.draw(rng)
         self._start(phantom.volume(SIDE_MM / GRID), phantom.scene)
 
     def add(self, lab: Lab, poses: Poses, rng: np.random.Generator) -> float:
-        """See `InformationTask`."""
+        """Take one frame, improve the reconstruction by SIRT and return its gain in
+        quality.
+
+        Args:
+            lab: the scanner.
+            poses: of the frame.
+            rng: of the noise.
+        """
         cone = lab.small(poses, NOMINAL)
         image = noisy(self.show(lab, poses), PHOTONS, rng)
         self.images.append(image)
@@ -176,32 +194,33 @@ class QualityTask:
         return self.judge()
 
     def judge(self) -> float:
-        """What the last reconstruction gained."""
+        """Compute the gain in quality of the last reconstruction."""
         before, self._quality = self._quality, quality(self.volume, self._truth)
         return self._quality - before
 
     def state(self) -> Float32Array:
-        """Residual of the present reconstruction, and how much of the object is determined."""
+        """Return the residual of the present reconstruction, and the determined part
+        of the object."""
         known = 1.0 - 1.0 / (1.0 + np.log(np.linalg.eigvalsh(self._precision)).mean())
         return np.array([min(self._residual, 1.0), min(max(known, 0.0), 1.0)], np.float32)
 
     def show(self, lab: Lab, poses: Poses) -> Float32Array:
-        """See `InformationTask`."""
+        """Compute line integrals on the coarse detector; see `InformationTask`."""
         cone = lab.small(poses, NOMINAL)
         return np.asarray(project_scene(self._scene, cone, lab.small_shape)[0])
 
     def forecast(self, lab: Lab, poses: Poses) -> FloatArray:
-        """Information about an object of upright columns, whatever it is [nats]."""
+        """Compute the expected information about any object of upright columns [nats]."""
         more = self._precision + column_information(lab, lab.small(poses, NOMINAL))
         return np.array([0.5 * (_log_det(m) - _log_det(self._precision)) for m in more])
 
     def info(self) -> dict[str, float]:
-        """Quality so far."""
+        """Return quality and residual so far."""
         return {"quality": self._quality, "residual": self._residual}
 
 
 def random_object(rng: np.random.Generator) -> Phantom:
-    """An elongated body with four to seven ellipsoids in it, within 50 mm."""
+    """Draw an elongated body with four to seven ellipsoids in it, within 50 mm."""
     water = material("water").mu_per_mm
     turn = rng.uniform(0.0, math.pi)
     body = Ellipsoid(
@@ -221,7 +240,8 @@ def random_object(rng: np.random.Generator) -> Phantom:
 
 
 def random_plates(rng: np.random.Generator) -> Phantom:
-    """One or two parallel upright plates, turned by any angle: a few views see them edge-on."""
+    """Draw one or two parallel upright plates, turned by any angle: a few views see
+    them edge-on."""
     water, axes = material("water").mu_per_mm, _turned(rng.uniform(0.0, math.pi))
     count = int(rng.integers(1, 3))
     apart, start = rng.uniform(12.0, 18.0), rng.uniform(-4.0, 4.0)
@@ -235,13 +255,13 @@ def random_plates(rng: np.random.Generator) -> Phantom:
 
 
 def noisy(image: Float32Array, photons: float, rng: np.random.Generator) -> Float32Array:
-    """Line integrals as `photons` in the open beam measure them."""
+    """Add the noise of `photons` in the open beam to line integrals."""
     counts = rng.poisson(photons * np.exp(-image.astype(np.float64)))
     return np.asarray(np.log(photons) - np.log(np.maximum(counts, 0.5)), dtype=np.float32)
 
 
 def quality(volume: Volume, truth: Volume) -> float:
-    """1 - RMSE / RMS of the truth; 0 for an empty volume, 1 for a perfect one."""
+    """Compute 1 - RMSE / RMS of the truth; 0 for an empty volume, 1 for a perfect one."""
     rms = float(np.sqrt(np.mean(truth.data.astype(np.float64) ** 2)))
     error = volume.data.astype(np.float64) - truth.data
     return 1.0 - float(np.sqrt(np.mean(error**2))) / rms
@@ -253,12 +273,13 @@ def _turned(angle: float) -> tuple[Vector, Vector, Vector]:
 
 
 def blank() -> Volume:
-    """The grid of reconstructions, at zero."""
+    """Make the grid of reconstructions, at zero."""
     return Volume(np.zeros((GRID, GRID, GRID), np.float32), SIDE_MM / GRID)
 
 
 def column_information(lab: Lab, cone: ConeVec) -> FloatArray:
-    """(n, c, c) information of each frame about upright columns, against a prior of 1."""
+    """Compute each frame's information about upright columns, (n, c, c), against a
+    prior of 1."""
     rows, cols = lab.small_shape
     # An expected spread of 0.02/mm and photon noise of the line integral.
     a = column_lengths(cone, cols) * (0.02 * math.sqrt(PHOTONS * rows) / 3.0)
@@ -266,7 +287,8 @@ def column_information(lab: Lab, cone: ConeVec) -> FloatArray:
 
 
 def column_lengths(cone: ConeVec, cols: int, samples: int = 80) -> FloatArray:
-    """Length of each ray of the middle row in each upright column of the object, sampled.
+    """Sample the length of each ray of the middle row in each upright column of the
+    object.
 
     Args:
         cone: n views.
@@ -301,7 +323,7 @@ def _log_det(matrix: npt.NDArray[np.float64]) -> float:
 
 
 Task = InformationTask | QualityTask
-"""What an environment may be for; both have the same methods."""
+"""Task of an environment; both have the same methods."""
 
 TASKS: Final[Mapping[str, Callable[[], Task]]] = {
     "information": InformationTask,

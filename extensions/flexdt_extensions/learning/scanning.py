@@ -1,12 +1,14 @@
 """The environment in which an agent plans a scan: where to take the next frame.
 
-The reward is what the frame added (information about the geometry, or quality of the
-reconstruction) less the time and the dose it cost; a collision ends the episode. Kinematic time,
-swept collisions and projections come from the twin. Observations do not contain the hidden truth,
-but their sigmas are computed at it, where an agent's own estimate would give nearly the same.
+The reward is the gain of the frame (information about the geometry, or quality of the
+reconstruction) less its cost in time and dose; a collision ends the episode. Kinematic
+time, swept collisions and projections come from the twin. Observations do not contain the
+hidden truth, but their sigmas are computed at it, where an agent's own estimate would
+give nearly the same.
 
-Below it are baselines: random, equidistant, and greedy for information. A policy is a function of
-the environment: it reads only what an agent may know and returns an action.
+Below it are baselines: random, equidistant, and greedy for information. A policy is a
+function of the environment: it reads only data that an agent may know and returns an
+action.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ Action = npt.NDArray[np.float32] | np.int64
 Observation = npt.NDArray[Any]
 Kind = Literal["angle", "discrete", "pose"]
 SECTORS: Final = 36
-"""Angles a discrete action chooses among, and sectors of the record of angles taken."""
+"""Number of angles of a discrete action, and of sectors of the record of angles taken."""
 POSE_AXES: Final = ("mag_obj", "tra_obj", "mag_det")
 """Motors that a pose moves besides rot_obj: sample along the beam, sideways; detector along it."""
 GAIN: Final = {"information": 1.0, "quality": 20.0, "plates": 20.0}
@@ -40,23 +42,25 @@ GAIN: Final = {"information": 1.0, "quality": 20.0, "plates": 20.0}
 class ScanEnv(gymnasium.Env[Observation, Action]):
     """Choose poses, one frame at a time.
 
-    Actions: `angle`, one number in [-1, 1] for rot_obj from -180 to 180 deg; `discrete`, one of 36
-    angles; `pose`, four numbers in [-1, 1] for rot_obj and the whole travel of mag_obj, tra_obj
-    and mag_det, where stage and detector can run into each other.
+    Actions: `angle`, one number in [-1, 1] for rot_obj from -180 to 180 deg; `discrete`,
+    one of 36 angles; `pose`, four numbers in [-1, 1] for rot_obj and the full travel of
+    mag_obj, tra_obj and mag_det, where stage and detector can run into each other.
 
-    Observations: `state`, a vector in [-1, 1] (angle, the three other motors, frames left, time
-    used, the task's own features, which of 36 sectors have a frame); `projection`, the coarse
-    detector's image of the last frame as uint8 (rows, cols, 1).
+    Observations: `state`, a vector in [-1, 1] (angle, the three other motors, frames
+    left, time used, the task's own features, which of 36 sectors have a frame);
+    `projection`, the coarse detector's image of the last frame as uint8 (rows, cols, 1).
 
     Args:
         action, observation: see above.
-        task: information (calibrate with the LEGO phantom; gain in nats), quality (reconstruct a
-            random object; gain of 1 - RMSE / RMS), or plates (the same of parallel plates).
+        task: information (calibrate with the LEGO phantom; gain in nats), quality
+            (reconstruct a
+            random object; gain of 1 - RMSE / RMS), or plates (the same of parallel
+            plates).
         frames: of an episode; then it is truncated.
         time_weight: reward lost per second of motion and exposure.
         dose_weight: reward lost per unit of dose (see `Lab.take`).
         collision_penalty: reward lost by a collision, which ends the episode.
-        exposure_s: of a frame.
+        exposure_s: of a frame [s].
         render_mode: None or rgb_array.
     """
 
@@ -74,6 +78,12 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         exposure_s: float = 0.5,
         render_mode: Literal["rgb_array"] | None = None,
     ) -> None:
+        """Check the settings and make the scanner and the spaces; see the class.
+
+        Raises:
+            UnknownNameError: no such action, observation or task.
+            LimitError: a setting outside its range.
+        """
         for what, value, allowed in (
             ("action", action, ("angle", "discrete", "pose")),
             ("observation", observation, ("state", "projection")),
@@ -123,7 +133,15 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         return self._observe(), self._info(0.0, 0.0)
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Move, take a frame, and say what it was worth.
+        """Move, take a frame and score it.
+
+        Args:
+            action: see the class.
+
+        Returns:
+            Observation, reward, whether it collided, whether the frames are used up, and
+            the task's
+            figures with `collision`.
 
         Raises:
             LimitError: no action of this environment.
@@ -148,18 +166,26 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         return self._observe(), self._gain * worth - cost, False, done, info
 
     def new_lab(self) -> Lab:
-        """A scanner as it stands at the start of an episode."""
+        """Make a scanner in its state at the start of an episode."""
         return Lab(self.task.size_mm, self._exposure_s)
 
     def render(self) -> npt.NDArray[np.uint8] | None:
-        """The last frame, dark where the object absorbs, four screen pixels a coarse pixel."""
+        """Render the last frame, dark where the object absorbs, eight screen pixels a
+        coarse pixel."""
         if self.render_mode is None:
             return None
         grey = np.uint8(255) - self._grey()
         return np.repeat(np.kron(grey, np.ones((8, 8), np.uint8))[..., None], 3, axis=2)
 
     def targets(self, action: Action) -> dict[str, float]:
-        """Motor targets of an action [deg, mm]."""
+        """Convert an action to motor targets [deg, mm].
+
+        Args:
+            action: of the kind of this environment.
+
+        Raises:
+            LimitError: no action of this environment.
+        """
         if self.kind == "discrete":
             return {"rot_obj": 360.0 * choices(action, [SECTORS])[0] / SECTORS}
         values = np.asarray(action, dtype=np.float64).ravel()
@@ -176,7 +202,7 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         return out
 
     def action_for(self, targets: dict[str, float]) -> Action:
-        """The action with these targets; the inverse of `targets`."""
+        """Convert targets to an action; the inverse of `targets`."""
         angle = (targets["rot_obj"] + 180.0) % 360.0 - 180.0
         if self.kind == "discrete":
             return np.int64(round(angle * SECTORS / 360.0) % SECTORS)
@@ -189,10 +215,11 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         return np.array(values, np.float32)
 
     def forecast(self, candidates: list[dict[str, float]]) -> npt.NDArray[np.float64]:
-        """Expected reward of each candidate, (m,), from what an agent may know.
+        """Compute the expected reward of each candidate, (m,), from data that an agent
+        may know.
 
         Args:
-            candidates: motor positions [deg, mm], not looked at for collisions.
+            candidates: motor positions [deg, mm], not checked for collisions.
         """
         poses = Poses.concatenate([self.lab.poses(c) for c in candidates])
         seconds = np.array([self.lab.seconds_to(c) for c in candidates])
@@ -213,7 +240,8 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         return np.clip(vector, -1.0, 1.0)
 
     def _grey(self) -> npt.NDArray[np.uint8]:
-        """The last frame's line integrals from 0 to 3 as 0 to 255; zeros before the first."""
+        """Convert the last frame's line integrals from 0 to 3 to 0 to 255; zeros
+        before the first."""
         if self._last is None:
             return np.zeros(self.lab.small_shape, np.uint8)
         image = self.task.show(self.lab, self._last)
@@ -236,19 +264,20 @@ Policy = Callable[[ScanEnv, int], Action]
 
 
 def uniform(env: ScanEnv, frame: int) -> Action:
-    """Any action; poses anywhere in the travel, collisions included."""
+    """Draw any action; poses anywhere in the travel, collisions included."""
     if env.kind == "pose":
         return env.np_random.uniform(-1.0, 1.0, 4).astype(np.float32)
     return env.action_for({"rot_obj": float(env.np_random.uniform(-180.0, 180.0))})
 
 
 def equidistant(env: ScanEnv, frame: int) -> Action:
-    """One turn in equal steps, as every scan script does."""
+    """Choose one turn in equal steps, as every scan script does."""
     return env.action_for({"rot_obj": 360.0 * frame / env.frames})
 
 
 def greedy(env: ScanEnv, frame: int) -> Action:
-    """The angle that promises most information for its time, at the nominal geometry."""
+    """Choose the angle of most expected information for its time, at the nominal
+    geometry."""
     candidates = [{"rot_obj": 360.0 * i / SECTORS} for i in range(SECTORS)]
     if env.kind == "pose":
         here = env.lab.position("mag_obj")
@@ -266,12 +295,12 @@ POLICIES: Final[Mapping[str, Policy]] = {
 
 @dataclass(frozen=True)
 class Episode:
-    """What happened, frame by frame.
+    """Record of an episode, frame by frame.
 
     Attributes:
         rewards: of each step.
-        infos: what the environment said of each.
-        targets: motor positions asked for.
+        infos: of the environment, for each step.
+        targets: motor positions of the actions.
         collided: it ended so.
     """
 
@@ -282,7 +311,7 @@ class Episode:
 
 
 def play(env: ScanEnv, policy: Policy, seed: int) -> Episode:
-    """One episode from `seed`."""
+    """Run one episode from `seed`."""
     env.reset(seed=seed)
     rewards: list[float] = []
     infos: list[dict[str, Any]] = []

@@ -14,12 +14,23 @@ from flexdt.measuring import parallel
 def solve(
     first, voxel, length, rows, columns, taken, counts, images, volumes, iterations, smallest
 ):
-    """Improve volumes (objects, voxels) in place; returns each object's sum of squared residuals.
+    """Improve volumes by SIRT, in place, all objects at once.
 
-    first (views, rays + 1): where the voxels and lengths [mm] of each ray begin; rows (views, rays)
-    and columns (views, voxels): sums of lengths; taken (objects, frames): views, of which the
-    first counts (objects,) hold; images (objects, frames, rays): line integrals; smallest: part of
-    the largest sum below which sums are not divided by.
+    Args:
+        first: (views, rays + 1) index of the first voxel and length of each ray.
+        voxel: indices of voxels, ray after ray.
+        length: of the rays in these voxels [mm].
+        rows: (views, rays) sums of lengths.
+        columns: (views, voxels) sums of lengths.
+        taken: (objects, frames) views; the first `counts` hold.
+        counts: (objects,) numbers of frames.
+        images: (objects, frames, rays) line integrals.
+        volumes: (objects, voxels) improved in place.
+        iterations: number of iterations.
+        smallest: part of the largest sum below which sums are not divided by.
+
+    Returns:
+        (objects,) sums of squared residuals.
     """
     rays = rows.shape[1]
     squares = np.zeros(len(counts))

@@ -1,9 +1,10 @@
 """Many scan environments at once whose scanners only turn their samples.
 
-Each is a `ScanEnv` with its own object, noise and seed; what does not depend on these is computed
-once for all: motion times, poses, and the rays of the 36 angles as lists of voxels and lengths. An
-object's clean images of all angles are projected when it is drawn, and SIRT runs for all objects
-in one compiled call, so that a chosen angle adds its rays to what is there.
+Each is a `ScanEnv` with its own object, noise and seed; independent data are computed
+once for all: motion times, poses, and the rays of the 36 angles as lists of voxels and
+lengths. An object's clean images of all angles are projected when it is drawn, and SIRT
+runs for all objects in one compiled call, so that a chosen angle adds its rays to those
+taken.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ SMALLEST = 1e-6
 
 
 class Turntable:
-    """What scanners that only turn their samples have in common.
+    """Shared data of scanners that only turn their samples.
 
     Args:
         size_mm, exposure_s: as for `Lab`.
@@ -53,7 +54,7 @@ class Turntable:
         self._poses: dict[float, Poses] = {}
 
     def way(self, start: float, target: float) -> tuple[Taken, float]:
-        """What a turn of rot_obj costs, and where it ends [deg]."""
+        """Compute the cost of a turn of rot_obj, and its end [deg]."""
         upper = self.still.range_of("rot_obj")[1]
         turns = 0.0 if abs(start) > upper - 360.0 else start - start % 360.0
         key = start - turns, target % 360.0
@@ -65,7 +66,7 @@ class Turntable:
         return taken, end + turns
 
     def poses(self, angle: float) -> Poses:
-        """Nominal pose with rot_obj at an angle [deg]."""
+        """Return the nominal pose with rot_obj at an angle [deg]."""
         key = angle % 360.0
         if key not in self._poses:
             self._poses[key] = self.still.poses({"rot_obj": key})
@@ -79,7 +80,7 @@ class Turntable:
 
 @lru_cache(4)
 def turntable(size_mm: tuple[float, float, float], exposure_s: float) -> Turntable:
-    """The same for all environments of this process."""
+    """Make the turntable, the same for all environments of this process."""
     return Turntable(size_mm, exposure_s)
 
 
@@ -93,18 +94,18 @@ class TurnedLab(Lab):
         self.now = self.dose = 0.0
 
     def position(self, axis: str) -> float:
-        """Position of a motor [mm, deg]."""
+        """Return the position of a motor [mm, deg]."""
         return self.angle if axis == "rot_obj" else self.table.still.position(axis)
 
     def take(self, targets: dict[str, float]) -> Taken:
-        """As `Lab.take`, for a target of rot_obj."""
+        """Take a frame as `Lab.take`, for a target of rot_obj."""
         taken, self.angle = self.table.way(self.angle, targets["rot_obj"])
         self.now += taken.seconds
         self.dose += taken.dose
         return taken
 
     def poses(self, targets: dict[str, float] | None = None) -> Poses:
-        """As `Lab.poses`."""
+        """Return the poses as `Lab.poses`."""
         angle = (targets or {}).get("rot_obj", self.angle)
         return self.table.poses(angle)
 
@@ -118,6 +119,11 @@ class Rays:
     """
 
     def __init__(self, table: Turntable) -> None:
+        """Compute voxels, lengths and sums of all rays of the 36 angles.
+
+        Args:
+            table: poses and detector.
+        """
         lab = table.still
         poses = [table.poses(360.0 * i / SECTORS) for i in range(SECTORS)]
         self.cone = lab.small(Poses.concatenate(poses), NOMINAL)
@@ -135,7 +141,12 @@ class Rays:
         )
 
     def solve(self, tasks: Sequence[SharedQuality]) -> None:
-        """What `QualityTask` does with all frames of one object, for many."""
+        """Run SIRT with all frames of each object, as `QualityTask` does, for many
+        objects at once.
+
+        Args:
+            tasks: with at least one frame each; their volumes and residuals are updated.
+        """
         from flexdt_extensions.learning import sirt_kernels
 
         counts = np.array([len(task.sectors) for task in tasks])
@@ -163,14 +174,14 @@ class SharedQuality(QualityTask):
         super().__init__(draw)
 
     def reset(self, lab: Lab, rng: np.random.Generator) -> None:
-        """A new object, projected at every sector."""
+        """Draw a new object, projected at every sector."""
         super().reset(lab, rng)
         self._clean = project_scene(self._scene, self.table.rays.cone, lab.small_shape)
         self.sectors: list[int] = []
         self._ahead = False
 
     def show(self, lab: Lab, poses: Poses) -> Float32Array:
-        """See `QualityTask`."""
+        """Return the clean image of the present angle; see `QualityTask`."""
         return np.asarray(self._clean[_sector(lab.position("rot_obj"))])
 
     def measure(self, sector: int, rng: np.random.Generator) -> None:
@@ -180,7 +191,7 @@ class SharedQuality(QualityTask):
         self._ahead = True
 
     def add(self, lab: Lab, poses: Poses, rng: np.random.Generator) -> float:
-        """See `QualityTask`."""
+        """Take one frame and return its gain in quality; see `QualityTask`."""
         if not self._ahead:
             self.measure(_sector(lab.position("rot_obj")), rng)
             self.table.rays.solve([self])
@@ -204,7 +215,7 @@ class _TurnEnv(ScanEnv):
             self.task = SharedQuality(table, self.task.draw)
 
     def new_lab(self) -> Lab:
-        """See `ScanEnv`."""
+        """Make a scanner that only turns; see `ScanEnv`."""
         return TurnedLab(turntable(self.task.size_mm, self._exposure_s))
 
     def measure(self, action: Action) -> SharedQuality | None:
@@ -267,7 +278,7 @@ class ScanVectorEnv(SyncVectorEnv):
         npt.NDArray[np.bool_],
         dict[str, Any],
     ]:
-        """One step of each.
+        """Run one step of each environment.
 
         Args:
             actions: (num_envs,), one of 36 angles each.
@@ -297,10 +308,15 @@ def _sector(angle: float) -> int:
 
 
 def _lengths(cone: ConeVec, shape: tuple[int, int]) -> tuple[VoxelArray, Float32Array]:
-    """Voxels that each ray of one view crosses and its length in them, both (rays, k) [mm].
+    """Compute the voxels that each ray of one view crosses and its length in them, both
+    (rays, k) [mm].
 
-    A ray is cut at every plane between voxels, in the order in which it meets them; pieces outside
-    the volume have length 0.
+    A ray is cut at every plane between voxels, in the order in which it meets them;
+    pieces outside the volume have length 0.
+
+    Args:
+        cone: one view.
+        shape: detector (rows, cols).
     """
     rows, cols = ((np.arange(n) - (n - 1) / 2.0) for n in shape)
     ends = cone.detector + (rows[:, None, None] * cone.v + cols[:, None] * cone.u).reshape(-1, 3)
