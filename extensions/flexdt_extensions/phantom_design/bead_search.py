@@ -48,7 +48,8 @@ _TRIAL_SHIFT_MM: Final = 2.0
 def share_identified(
     model: BeadModel, planned: PlannedScans, *, trials: int = 3, seed: int = 1, frames: int = 24
 ) -> float:
-    """Share of simulated scans, each from a start angle of its own, whose beads are distinguished.
+    """Compute the share of simulated scans, each from its own start angle, whose beads
+    are told apart.
 
     Args:
         model: the beads.
@@ -79,13 +80,15 @@ def share_identified(
 def measured_spread(
     model: BeadModel, planned: PlannedScans, *, trials: int = 60, seed: int = 1
 ) -> dict[str, float]:
-    """Root mean square error of real fits to noisy simulated points: parameters and IN_IMAGES.
+    """Simulate fits to noisy points and compute the rms error of parameters and
+    IN_IMAGES.
 
     The check of `design.forecast`.
 
     Args:
-        model: the beads; with a tolerance in `planned` each trial's beads are off by it, and what
-            has a prior by that.
+        model: the beads; with a tolerance in `planned` each trial's beads are off by it,
+            and
+            parameters by their priors.
         planned: the scans.
         trials: fits.
         seed: of the noise.
@@ -120,7 +123,7 @@ def measured_spread(
 
 
 def _tracks(model: BeadModel, planned: PlannedScans, at: Offsets) -> FloatArray:
-    """(n, k, 2) pixels of the spots that count, nan elsewhere."""
+    """Project the beads: (n, k, 2) pixels of the spots that count, nan elsewhere."""
     cone = planned.poses.cone_vec(at)
     pixels = cone.project_points(model.beads, planned.shape)
     hidden = overlapping(pixels, spot_radii(model, planned.poses.cone_vec(at)))
@@ -144,7 +147,8 @@ def _shadows(
 
 
 def _named(index: npt.NDArray[np.int64], owner: npt.NDArray[np.intp]) -> npt.NDArray[np.int64]:
-    """For each bead of a frame: 1 if its spot is its own, 0 if another's, -1 if it has none."""
+    """Compare each bead's spot with its owner: 1 for its own, 0 for another's, -1
+    without a spot."""
     out = np.full(len(index), -1, dtype=np.int64)
     hit = index >= 0
     out[hit] = owner[index[hit]] == np.flatnonzero(hit)
@@ -152,19 +156,22 @@ def _named(index: npt.NDArray[np.int64], owner: npt.NDArray[np.intp]) -> npt.NDA
 
 
 DESIGN_FRAMES: Final = 48
-"""Frames that take part in the search, spread over the plan; the answer is predicted with all."""
+"""Largest number of frames in the search, spread over the plan; the forecast uses all
+frames."""
 _TRIED: Final = 12
-"""Seats tried for one bead, best first, before it stays where it is."""
+"""Number of seats tried for one bead, best first, before it keeps its own."""
 _TURNS: Final = np.radians(np.arange(10.0, 351.0, 5.0))
 
 
 @dataclass(frozen=True, eq=False)
 class BeadForecast:
-    """What the planned scans would determine with some beads.
+    """Forecast of the planned scans with some beads.
 
     Attributes:
-        sigmas: parameter -> predicted standard deviation, edge units; inf if not determined.
-        image_sigmas: the same of IN_IMAGES: column [px] and angle [deg] of the axis, magnification.
+        sigmas: parameter -> predicted standard deviation, edge units; inf if not
+            determined.
+        image_sigmas: the same of IN_IMAGES: column [px] and angle [deg] of the axis,
+            magnification.
         score: value of the criterion, smaller is better.
         used: share of all spots that count (in view, touching no other).
     """
@@ -198,7 +205,7 @@ class Design:
 
 
 def forecast(model: BeadModel, planned: PlannedScans, criterion: Criterion = "a") -> BeadForecast:
-    """Predicted uncertainties, touching spots left out.
+    """Compute the predicted uncertainties, touching spots left out.
 
     Args:
         model: the beads.
@@ -242,14 +249,15 @@ def design(
         radius_mm: of every bead.
         count: beads to place.
         planned: the scans to be determined.
-        criterion: what is minimised.
-        slots: (m,) which brick a seat is in; None: all in one.
+        criterion: to be minimised.
+        slots: (m,) number of the brick of each seat; None: all in one.
         per_slot: most beads in one slot; None: any.
         gap_mm: least distance between two beads' surfaces.
         unlike_mm: least `turned_likeness`; symmetric sets have none.
         starts: random starts.
         seed: the same seed gives the same design.
-        bounds_mm: (3,) half extents within which centres may afterwards be moved off the seats.
+        bounds_mm: (3,) half extents within which centres may afterwards be moved off the
+            seats.
         resolution_mm: smallest step of those moves.
 
     Raises:
@@ -302,7 +310,8 @@ def design(
 
 
 def turned_likeness(beads: FloatArray) -> float:
-    """How far beads are from a turned and shifted copy of themselves, at the best turn [mm].
+    """Measure the distance of beads from a turned and shifted copy, at the best turn
+    [mm].
 
     Root mean square distance between each bead and the one it would be taken for, over turns about
     the vertical of 10 to 350 deg in steps of 5; 0 for a set that looks the same after such a turn.
@@ -342,7 +351,7 @@ class _Rules:
 def _allowed(
     table: SeatTable, rules: _Rules, others: npt.NDArray[np.int64]
 ) -> npt.NDArray[np.bool_]:
-    """(m,) seats that a further bead may take beside `others`."""
+    """Find the seats that a further bead may take, given `others`: (m,)."""
     gaps = np.linalg.norm(table.places[:, None] - table.places[others][None], axis=2)
     full = np.bincount(rules.slot[others], minlength=int(rules.slot.max()) + 1) >= rules.most
     seen = table.visible.any(axis=1)
@@ -368,7 +377,17 @@ def _random_set(
 def _exchanged(
     table: SeatTable, rules: _Rules, chosen: npt.NDArray[np.int64], criterion: Criterion
 ) -> tuple[npt.NDArray[np.int64], float]:
-    """Exchange beads one at a time for the best seat until no exchange helps."""
+    """Replace beads one at a time by the best seat until no exchange helps.
+
+    Args:
+        table: of the seats.
+        rules: distances, slots and likeness.
+        chosen: (k,) seats to begin with.
+        criterion: to be minimised.
+
+    Returns:
+        The seats, and their score.
+    """
     masks = table.alone(chosen)
     summed = np.einsum("kn,knf->kf", masks.astype(np.float64), table.blocks[chosen])
     best = float(score_of(table.felt(table.marginal(summed).sum(axis=0))[None], criterion)[0])
@@ -395,7 +414,7 @@ def _exchanged(
 def _scores_beside(
     table: SeatTable, others: npt.NDArray[np.int64], criterion: Criterion
 ) -> FloatArray:
-    """(m,) the criterion of `others` with each seat added."""
+    """Compute the criterion of `others` with each seat added, (m,)."""
     m = len(table.places)
     touch = table.touching(np.arange(m), others)  # (m, k-1, n)
     own = (table.visible & ~touch.any(axis=1)).astype(np.float64)
@@ -417,7 +436,22 @@ def _polished(
     bounds: FloatArray,
     resolution: float,
 ) -> tuple[FloatArray, npt.NDArray[np.int64]]:
-    """Move beads off their seats by ever smaller steps while that helps."""
+    """Move beads off their seats by ever smaller steps while that helps.
+
+    Args:
+        beads: (k, 3) [mm].
+        index: (k,) seat of each bead; -1 once it is moved.
+        radius: of the beads [mm].
+        planned: the scans.
+        weight: of each frame.
+        criterion: to be minimised.
+        rules: distances and likeness.
+        bounds: (3,) half extents [mm].
+        resolution: smallest step [mm].
+
+    Returns:
+        Beads and seats after the moves.
+    """
     beads, index = beads.copy(), index.copy()
     steps = np.array([s for s in np.ndindex(3, 3, 3) if s != (1, 1, 1)], dtype=np.float64) - 1.0
     size = float(bounds.max()) / 8.0

@@ -1,14 +1,14 @@
-"""The information that a bead at each possible position contributes to planned scans, and the score
-of a set of positions.
+"""The information that a bead at each possible position contributes to planned scans, and
+the score of a set of positions.
 
-Each bead adds a block of its own to the Fisher information of the planned frames, so a set of
-positions is judged by adding blocks, and what is known beforehand of the parameters. A spot that
-touches another one in a frame counts for nothing there, as in identification. `bead_search` does
-the choosing.
+Each bead adds a block of its own to the Fisher information of the planned frames, so a
+set of positions is judged by the sum of blocks and of the parameters' priors. A spot that
+touches another one in a frame counts for nothing there, as in identification.
+`bead_search` does the choosing.
 
-A set is scored by what a reconstruction feels: how far column and angle of the axis and
-magnification displace the image at the panel's edge. Of the stage's offsets, most is what is not
-known of the panel, which no bead tells.
+A set is scored by its effect on a reconstruction: the displacement of the image at the
+panel's edge by column and angle of the axis and magnification. The stage's offsets are
+dominated by the unknown offsets of the panel, which no bead determines.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ CRITERIA: Final[Mapping[Criterion, str]] = {
     "worst": "the largest displacement at the panel's edge [px] by one of them",
 }
 AT_ONCE: Final = 8
-"""Seats whose share is computed together."""
+"""Number of seats whose share is computed together."""
 RIDGE: Final = 1e-9
-"""Information added so that sets which determine too little can still be compared."""
+"""Information added so that sets that determine too little can still be compared."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,9 +58,11 @@ class PlannedScans:
         shape: detector (rows, cols).
         noise_px: standard deviation of a detected coordinate.
         free: parameters to be estimated, shared by all placements.
-        bead_tolerance_mm: > 0: how well beads sit where they should; they are estimated, too.
-        priors: what is known of the other parameters [mm, deg, 1], 0 exactly; None: as `known` of
-            `fit.priors` has it.
+        bead_tolerance_mm: > 0: standard deviation of the beads' places; they are
+            estimated, too.
+        priors: standard deviations of the other parameters [mm, deg, 1], 0 exactly known;
+            None: as
+            `known` of `fit.priors` has it.
     """
 
     poses: Poses
@@ -76,11 +78,11 @@ class PlannedScans:
         return known(self.free) if self.priors is None else self.priors
 
     def sizes(self) -> FloatArray:
-        """(n, 2) detector (rows, cols) of each frame."""
+        """Return (n, 2) detector (rows, cols) of each frame."""
         return np.broadcast_to(np.asarray(self.shape, dtype=np.float64), (len(self.poses), 2))
 
     def thinned(self, frames: int) -> tuple[PlannedScans, float]:
-        """At most `frames` of the frames, and how many each stands for."""
+        """Select at most `frames` of the frames; returns the weight of each as well."""
         n = len(self.poses)
         if n <= frames:
             return self, 1.0
@@ -92,11 +94,12 @@ class PlannedScans:
 class SeatTable:
     """Every seat's share in the information, frame by frame.
 
-    `blocks` (m, n, q q) is a seat's information in one frame, parameters in units of their
-    tolerance, the bead's own coordinates after them; `pixels` (m, n, 2) and `reach` (m, n) say
-    where its spot is and how far it must stay from others'; `visible` (m, n). `known` (p,) is the
-    information of the parameters' priors, and `slopes` (3, p) how they change IN_IMAGES, both in
-    tolerances; `edge_px` (3,) is the displacement at the panel's edge by a unit of these.
+    `blocks` (m, n, q q) is a seat's information in one frame, parameters in units of
+    their tolerance, the bead's own coordinates after them; `pixels` (m, n, 2) and `reach`
+    (m, n) are the place of its spot and its least distance from others'; `visible` (m,
+    n). `known` (p,) is the information of the parameters' priors, and `slopes` (3, p) the
+    derivatives of IN_IMAGES, both in tolerances; `edge_px` (3,) is the displacement at
+    the panel's edge by a unit of these.
     """
 
     places: FloatArray
@@ -116,7 +119,15 @@ class SeatTable:
     def of(
         cls, places: FloatArray, radius: float, planned: PlannedScans, weight: float
     ) -> SeatTable:
-        """The table of places for beads of a radius [mm]; each frame counts `weight` times."""
+        """Compute the table of places for beads of a radius; each frame counts `weight`
+        times.
+
+        Args:
+            places: (m, 3) [mm].
+            radius: of the beads [mm].
+            planned: the scans.
+            weight: of each frame.
+        """
         problems = [
             _problem(BeadModel(places[first : first + AT_ONCE], np.array(radius)), planned)
             for first in range(0, len(places), AT_ONCE)
@@ -147,7 +158,8 @@ class SeatTable:
         )
 
     def touching(self, a: npt.NDArray[np.int64], b: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-        """(a, b, n) whether the spots of two seats touch; the rule of `identify.overlapping`."""
+        """Compare the spots of two seats, (a, b, n): True if they touch, by
+        `identify.overlapping`."""
         first, second = self.pixels[a], self.pixels[b]
         across = first[:, None, :, 0] - second[None, :, :, 0]
         down = first[:, None, :, 1] - second[None, :, :, 1]
@@ -155,18 +167,19 @@ class SeatTable:
         return np.asarray(across * across + down * down < reach * reach)
 
     def alone(self, chosen: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-        """(k, n) which spots of a set count."""
+        """Find the spots of a set that count, (k, n)."""
         touch = self.touching(chosen, chosen)
         touch[np.arange(len(chosen)), np.arange(len(chosen))] = False
         return np.asarray(self.visible[chosen] & ~touch.any(axis=1))
 
     def information(self, masks: npt.NDArray[np.bool_]) -> FloatArray:
-        """(p, p) of a set of all seats under masks (m, n)."""
+        """Sum up the information (p, p) of a set of all seats under masks (m, n)."""
         summed = np.einsum("mn,mnf->mf", masks.astype(np.float64), self.blocks)
         return np.asarray(self.marginal(summed).sum(axis=0))
 
     def marginal(self, summed: FloatArray) -> FloatArray:
-        """(..., p, p): beads' summed blocks (..., q q) with the beads' own places marginalised."""
+        """Reduce beads' summed blocks (..., q q) to (..., p, p), the beads' own places
+        marginalised."""
         p = len(self.names)
         q = p + (3 if self.prior > 0 else 0)
         full = summed.reshape(*summed.shape[:-1], q, q)
@@ -179,21 +192,26 @@ class SeatTable:
         )
 
     def felt(self, information: FloatArray) -> FloatArray:
-        """(..., 3, 3) covariance of IN_IMAGES [px at the panel's edge] for information (..., p, p)
-        of the images; where it is not determined, by a little information that is added."""
+        """Compute the covariance (..., 3, 3) of IN_IMAGES [px at the panel's edge].
+
+        Args:
+            information: (..., p, p) of the images; `RIDGE` is added for parameters not
+                determined.
+        """
         whole = information + np.diag(self.known + RIDGE)
         rows = self.slopes * self.edge_px[:, None]
         return np.asarray(rows @ np.linalg.solve(whole, rows.T))
 
 
 def _edge_px(seen: FloatArray, shape: tuple[int, int]) -> FloatArray:
-    """Displacement at the panel's edge [px] by a unit of each of IN_IMAGES: px, deg, 1."""
+    """Compute the displacement at the panel's edge [px] by a unit of each of
+    IN_IMAGES: px, deg, 1."""
     rows, cols = shape
     return np.array([1.0, math.radians(1.0) * rows / 2.0, cols / 2.0 / seen[2]])
 
 
 def _problem(model: BeadModel, planned: PlannedScans) -> FitProblem:
-    """The planned scans of some beads, every spot of them seen."""
+    """Build the problem of the planned scans of some beads, every spot of them seen."""
     n, k = len(planned.poses), len(model)
     return build_problem(
         np.zeros((n, k, 2)), model, planned.poses, free=planned.free, shape=planned.sizes(),
@@ -202,7 +220,7 @@ def _problem(model: BeadModel, planned: PlannedScans) -> FitProblem:
 
 
 def _rows(problem: FitProblem) -> FloatArray:
-    """Whitened Jacobian rows of each bead, (k, n, 2, q) edge units."""
+    """Compute the whitened Jacobian rows of each bead, (k, n, 2, q) edge units."""
     n, k = problem.seen.shape
     factor = np.array([edge_factor(name) for name in problem.layout.names])
     rows = (problem.jacobian(problem.start) / factor).reshape(n, k, 2, -1).transpose(1, 0, 2, 3)
@@ -215,7 +233,8 @@ def _rows(problem: FitProblem) -> FloatArray:
 
 
 def inverse(information: FloatArray) -> FloatArray:
-    """Covariances (..., p, p) in units of tolerances; infinite diagonal where not determined."""
+    """Compute covariances (..., p, p) in units of tolerances; infinite diagonal where
+    not determined."""
     values, vectors = np.linalg.eigh(information)
     lost = values <= 1e-12 * np.maximum(values[..., -1:], 1e-300)
     safe = np.where(lost, np.inf, values)
@@ -227,7 +246,7 @@ def inverse(information: FloatArray) -> FloatArray:
 
 
 def score_of(covariance: FloatArray, criterion: Criterion) -> FloatArray:
-    """The criterion of a stack of covariances (m, q, q)."""
+    """Compute the criterion of a stack of covariances (m, q, q)."""
     variances = np.diagonal(covariance, axis1=-2, axis2=-1)
     match criterion:
         case "a":

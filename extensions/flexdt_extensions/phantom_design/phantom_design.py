@@ -1,10 +1,11 @@
-"""`flexdt phantom design`: bead places, beside the spiral's, and how to build them.
+"""`flexdt phantom design`: bead places, compared with the spiral's, and how to build
+them.
 
-The search itself is `bead_search`. This module turns a request into poses and seats, checks the
-forecast by fits to noisy simulated points, and writes the result.
+The search itself is `bead_search`. This module turns a request into poses and seats,
+checks the forecast by fits to noisy simulated points, and writes the result.
 
-The building instructions are a drawing and a list of steps for each brick of a stack, or for each
-height at which a block holds beads.
+The building instructions are a drawing and a list of steps for each brick of a stack, or
+for each height at which a block holds beads.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ GRID_STEP_MM = 4.0
 
 @dataclass(frozen=True)
 class BeadHolder:
-    """What holds the beads.
+    """Holder of the beads.
 
     Attributes:
         bricks: a LEGO stack, or None for a block.
@@ -83,16 +84,19 @@ class DesignRequest:
 def circle_poses(
     machine: Machine, placements: Sequence[tuple[float, float]], sdd_mm: float, frames: int
 ) -> tuple[Poses, tuple[int, int]]:
-    """One turn per placement (SOD, lateral), beam through the phantom's middle; and the detector.
+    """Compute one turn per placement (SOD, lateral), beam through the phantom's middle.
 
     Args:
-        machine: its default camera is meant.
+        machine: with its default camera.
         placements: (SOD, lateral shift) [mm].
-        sdd_mm: source-detector distance.
+        sdd_mm: source-detector distance [mm].
         frames: of each turn.
 
+    Returns:
+        Poses of all frames, and the detector's shape (rows, cols).
+
     Raises:
-        CommandError: the phantom would not stand between source and detector.
+        CommandError: the phantom would not be between source and detector.
     """
     for sod, lateral in placements:
         if not (0.0 < sod < sdd_mm < math.inf and math.isfinite(lateral)):
@@ -111,7 +115,15 @@ def circle_poses(
 
 
 def script_poses(text: str, machine: Machine, profile: Profile) -> tuple[Poses, tuple[int, int]]:
-    """The poses of a script's projections, the phantom's middle at the sample's height.
+    """Plan a script and compute its projections' poses, the phantom's middle at the
+    sample's height.
+
+    Args:
+        text: the script.
+        machine, profile: to plan it with.
+
+    Returns:
+        Poses, and the detector's shape (rows, cols).
 
     Raises:
         ScriptError: the script does not hold.
@@ -144,7 +156,19 @@ def run_design(
     out: Path | None = None,
     tell: Tell,
 ) -> dict[str, Any]:
-    """Design, compare, check, and write `out`; the document of `--json`.
+    """Search a design, compare it with the spiral, check both by fits, and write `out`.
+
+    Args:
+        body: holder of the beads.
+        scans: planned.
+        request: number of beads, criterion, trials and seed.
+        out: folder for the files of `write`; None writes nothing.
+        tell: called with each line of progress.
+
+    Returns:
+        The document of `--json`: request, `design`, `spiral`, `gain`, `assumed` and, if
+        written,
+        `files`.
 
     Raises:
         TwinError: the beads do not fit, or every set is ambiguous.
@@ -198,7 +222,7 @@ def run_design(
 
 
 def verdict(document: dict[str, Any]) -> str:
-    """The comparison of the design with the spiral, as a sentence."""
+    """Compare the design with the spiral in a sentence."""
     name, gain = document["spiral"]["name"], document["gain"]
     if gain is None:
         return f"{name} does not determine the geometry in this scan (its shadows hide each other)"
@@ -206,8 +230,16 @@ def verdict(document: dict[str, Any]) -> str:
 
 
 def table_rows(document: dict[str, Any]) -> list[tuple[str, ...]]:
-    """What a reconstruction feels and is optimised, then the parameters that it follows from: name,
-    unit, then predicted and measured of both, and the ratio of the predictions."""
+    """Make the rows of the comparison: optimised effects in the images, then the
+    parameters.
+
+    Args:
+        document: of `run_design`.
+
+    Returns:
+        Name, unit, predicted and measured of both, and the ratio of the predictions, as
+        text.
+    """
     ours, theirs = document["design"], document["spiral"]
     return [
         (
@@ -230,7 +262,18 @@ HEADER = ("parameter", "unit", "design", "measured", "spiral", "measured", "gain
 def write(
     out: Path, phantom: Phantom, body: BeadHolder, request: DesignRequest, document: dict[str, Any]
 ) -> list[str]:
-    """Write phantom.json, phantom.stl, build.html, one PNG per picture and design.json; names."""
+    """Write phantom.json, phantom.stl, build.html, one PNG per picture and design.json.
+
+    Args:
+        out: folder, made if need be.
+        phantom: the design.
+        body: holder of the beads.
+        request: radius of the beads.
+        document: of `run_design`.
+
+    Returns:
+        Names of the files.
+    """
     out.mkdir(parents=True, exist_ok=True)
     names = ["phantom.json", "phantom.stl", "build.html"]
     (out / "phantom.json").write_text(json.dumps(phantom.to_dict()), encoding="utf-8")
@@ -268,6 +311,13 @@ def _search(body: BeadHolder, scans: PlannedScans, request: DesignRequest) -> De
 
 
 def _phantom(body: BeadHolder, found: Design, request: DesignRequest) -> Phantom:
+    """Build the phantom of a design: a stack of bricks, or a block.
+
+    Args:
+        body: holder of the beads.
+        found: places of the beads.
+        request: number, radius and material of the beads.
+    """
     name = f"designed-{request.beads}"
     if body.bricks is not None:
         return stack_phantom(
@@ -287,7 +337,8 @@ def _phantom(body: BeadHolder, found: Design, request: DesignRequest) -> Phantom
 
 
 def _spiral(body: BeadHolder, request: DesignRequest) -> tuple[npt.NDArray[np.float64], str]:
-    """The thesis's beads for the same body and number, to compare with."""
+    """Return the thesis's beads (k, 3) for the same body and number, and the name of
+    the set."""
     if body.bricks == Brickwork() and request.beads == 5:
         return lego_phantom().beads, "lego (thesis 6.5.1)"
     size = body.size_mm
@@ -298,7 +349,8 @@ def _spiral(body: BeadHolder, request: DesignRequest) -> tuple[npt.NDArray[np.fl
 
 
 def _solid(phantom: Phantom, body: BeadHolder) -> trimesh.Trimesh:
-    """What the STL holds: bricks and beads as they are, or the block with beads as cavities."""
+    """Build the mesh of the STL: bricks and beads, or the block with beads as
+    cavities."""
     mesh = phantom.mesh()
     if body.bricks is not None:
         return mesh
@@ -311,6 +363,13 @@ def _solid(phantom: Phantom, body: BeadHolder) -> trimesh.Trimesh:
 
 
 def _page(phantom: Phantom, sections: Sequence[str], document: dict[str, Any]) -> str:
+    """Make the page of the building instructions.
+
+    Args:
+        phantom: the design.
+        sections: HTML of the drawings and steps.
+        document: of `run_design`.
+    """
     beads = [
         f"bead {k + 1}: ({x:+.2f}, {y:+.2f}, {z:+.2f}) mm"
         for k, (x, y, z) in enumerate(phantom.beads.tolist())
@@ -338,7 +397,7 @@ def _of(measured: dict[str, float] | None, name: str) -> str:
 
 
 SCALE = 12.0
-"""Pixels per millimetre."""
+"""Scale of the drawings [pixels/mm]."""
 MARGIN_MM = 5.5
 BRICK, HOLE, TUBE, LINE = "#f2d16b", "#fffaf0", "#e3b93f", "#7a6420"
 BEAD = COLOURS[1]
@@ -349,9 +408,9 @@ class Drawing:
     """One drawing of the instructions.
 
     Attributes:
-        title: what it shows.
+        title: of the drawing.
         figure: to scale, x to the right and y down [mm] from the middle.
-        steps: what to do, one line each.
+        steps: instructions, one line each.
     """
 
     title: str
@@ -359,11 +418,11 @@ class Drawing:
     steps: tuple[str, ...]
 
     def svg(self) -> str:
-        """As an SVG element."""
+        """Convert to an SVG element."""
         return svg(self.figure)
 
     def png(self) -> bytes:
-        """As a PNG file."""
+        """Convert to a PNG file."""
         file = io.BytesIO()
         self.figure.savefig(file, format="png", dpi=DPI)
         return file.getvalue()
@@ -372,7 +431,7 @@ class Drawing:
 def brick_drawings(
     work: Brickwork, beads: npt.NDArray[np.float64], radius: float
 ) -> Iterator[Drawing]:
-    """One drawing for each brick, seen from below, lowest brick first.
+    """Draw each brick, seen from below, lowest brick first.
 
     Args:
         work: the stack.
@@ -411,7 +470,7 @@ def brick_drawings(
 def level_drawings(
     size: Sequence[float], beads: npt.NDArray[np.float64], radius: float
 ) -> Iterator[Drawing]:
-    """One drawing for each height at which a block holds beads, seen from above, lowest first.
+    """Draw each height at which a block holds beads, seen from above, lowest first.
 
     Args:
         size: of the block along x, y and z [mm].
@@ -437,7 +496,8 @@ def level_drawings(
 
 
 def _sheet(wide: float, deep: float, top: str, bottom: str) -> Axes:
-    """The outline of a brick or block, its edges named, on axes that fill a figure."""
+    """Draw the outline of a brick or block, its edges named, on axes that fill a
+    figure."""
     w, h = wide + 2 * MARGIN_MM, deep + 2 * MARGIN_MM
     figure = blank(w * SCALE, h * SCALE)
     figure.set_layout_engine("none")

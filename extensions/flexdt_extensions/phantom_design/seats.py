@@ -42,7 +42,7 @@ class Seats:
 
 
 def stack_of(studs: tuple[int, int], bricks: int) -> Brickwork:
-    """A stack that can be built.
+    """Make a stack that can be built.
 
     Raises:
         LimitError: too few or too many studs or bricks.
@@ -58,14 +58,21 @@ def stack_of(studs: tuple[int, int], bricks: int) -> Brickwork:
 
 
 def tubes_at(work: Brickwork) -> FloatArray:
-    """(t, 2) axes of the tubes inside the bricks [mm]."""
+    """Compute the axes of the tubes inside the bricks, (t, 2) [mm]."""
     pitch = work.measures["stud_pitch_mm"]
     x, y = ((np.arange(n - 1) - (n - 2) / 2.0) * pitch for n in work.studs)
     return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
 def seats_of(work: Brickwork, radius_mm: float) -> Seats:
-    """Every seat for beads of this radius.
+    """List every seat for beads of this radius.
+
+    Args:
+        work: the stack.
+        radius_mm: of the beads.
+
+    Returns:
+        Places (m, 3) [mm, object frame], and the brick of each.
 
     Raises:
         LimitError: no bead of that radius fits.
@@ -100,7 +107,7 @@ def seats_of(work: Brickwork, radius_mm: float) -> Seats:
 def stack_phantom(
     work: Brickwork, name: str, beads: npt.ArrayLike, radius_mm: float, bead_material: str = "steel"
 ) -> Phantom:
-    """The stack with beads in its cavities.
+    """Build the stack with beads in its cavities.
 
     Args:
         work: the stack.
@@ -110,7 +117,7 @@ def stack_phantom(
         bead_material: of every bead.
 
     Raises:
-        PhantomError: a bead lies in plastic or outside.
+        PhantomError: a bead is in plastic or outside.
     """
     centers = np.asarray(beads, dtype=np.float64).reshape(-1, 3)
     seats = seats_of(work, radius_mm)
@@ -136,7 +143,8 @@ def stack_phantom(
 
 
 def grid_seats(size_mm: Sequence[float], radius_mm: float, step_mm: float) -> FloatArray:
-    """(m, 3) a grid of bead centres inside a cuboid about the origin, its faces included [mm].
+    """Make a grid of bead centres (m, 3) inside a cuboid about the origin, faces included
+    [mm].
 
     Raises:
         LimitError: the cuboid is smaller than a bead.
