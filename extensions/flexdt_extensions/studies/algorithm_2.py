@@ -1,12 +1,12 @@
 """Algorithm 2 of the thesis as printed, for comparison with our own fit.
 
-It has reprojection residuals and pairwise distances (eqs. 5.9 to 5.11), central differences (5.15),
-normal equations damped by lambda times the identity in mixed mm and rad (5.16), and acceptance,
-stall and convergence rules of its own. What the text leaves open, eta_conv, the steps of the
-differences, the unit of angles and the limit, is as its author's public code has it
-(data/author.toml). Beads are predicted as points; the thesis detects them in rendered projections.
-The printed text is not improved on: a rejected step counts towards stall and convergence, and
-lambda = 0 stays 0.
+It has reprojection residuals and pairwise distances (eqs. 5.9 to 5.11), central
+differences (5.15), normal equations damped by lambda times the identity in mixed mm and
+rad (5.16), and acceptance, stall and convergence rules of its own. Values that the text
+leaves open, eta_conv, the steps of the differences, the unit of angles and the limit, are
+those of its author's public code (data/author.toml). Beads are predicted as points; the
+thesis detects them in rendered projections. The printed text is not improved on: a
+rejected step counts towards stall and convergence, and lambda = 0 stays 0.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import Offsets
 
 CONVERGENCE = 1e-6
-"""eta_conv on the norm of a step, mm and degrees mixed."""
+"""Limit of convergence, eta_conv, on the norm of a step, mm and degrees mixed."""
 STEP, SMALL_STEP = 0.1, 0.01
-"""Of finite differences: positions [mm]; tau [mm] and angles [deg]."""
+"""Steps of finite differences: positions [mm]; tau [mm] and angles [deg]."""
 MAX_ITERATIONS = 200
 STALL_WINDOW = 5
-"""S_w of Algorithm 2."""
+"""Window of the stall rule, S_w of Algorithm 2 [iterations]."""
 STALL_THRESHOLD = 1e-8
-"""eta_stall of Algorithm 2."""
+"""Limit of the stall rule, eta_stall of Algorithm 2."""
 
 
 class Stop(enum.Enum):
@@ -104,7 +104,7 @@ def algorithm_2(problem: FitProblem, lam: float = 1e-2) -> Algorithm2:
 def iterate(
     residual: Callable[[FloatArray], FloatArray], x: FloatArray, steps: FloatArray, lam: float
 ) -> Iterated:
-    """The iteration of Algorithm 2 on any residuals.
+    """Run the iteration of Algorithm 2 on any residuals.
 
     Args:
         residual: parameters (p,) [mm, deg] to residuals (m,) [px]; inf where there are none.
@@ -146,7 +146,8 @@ def iterate(
 
 
 def bead_pairs(seen: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
-    """(frame, a, b) of every pair of beads seen together, (m, 3), from (frames, beads)."""
+    """List (frame, a, b) of every pair of beads seen together, (m, 3), from (frames,
+    beads)."""
     a, b = np.triu_indices(seen.shape[1], 1)
     frame, pair = np.nonzero(seen[:, a] & seen[:, b])
     return np.stack([frame, a[pair], b[pair]], axis=1)
@@ -158,7 +159,8 @@ def stacked(
     seen: npt.NDArray[np.bool_],
     pairs: npt.NDArray[np.intp],
 ) -> FloatArray:
-    """Eqs. 5.9, 5.10 and 5.11 stacked [px], from (frames, beads, 2) and `bead_pairs`."""
+    """Compute eqs. 5.9, 5.10 and 5.11 stacked [px], from (frames, beads, 2) and
+    `bead_pairs`."""
     frame, a, b = pairs.T
     near = np.linalg.norm(predicted[frame, a] - predicted[frame, b], axis=1)
     real = np.linalg.norm(measured[frame, a] - measured[frame, b], axis=1)

@@ -1,20 +1,22 @@
 """Experiment 4: the thesis's 242 fits of eleven real scans, explained by simulation.
 
-Each of the two groups of scans gets one physical truth: axis, mount and the angle of the first
-frame. Beads seen under it, by the scanner's smooth-scan rule (image i at i * 360 / (M - 1)), are
-fitted as the author's public code does: frames floor(linspace(0, M - 1, N)) taken to lie at
-360 n / N, the mount turned by +phi and the phantom by -(phi + alpha), centroids of binary blobs,
-Algorithm 2. The truth is what makes this reproduce the logged estimates at N = 360; every other N
-is predicted. The same spots are also fitted by ours, with the frames' own angles. The LEGO
-phantom's beads stand in for the author's, whose places are not public; nor are the radiographs.
+Each of the two groups of scans gets one physical truth: axis, mount and the angle of the
+first frame. Beads seen under it, by the scanner's smooth-scan rule (image i at i * 360 /
+(M - 1)), are fitted as the author's public code does: frames floor(linspace(0, M - 1, N))
+with assumed angles 360 n / N, the mount turned by +phi and the phantom by -(phi + alpha),
+centroids of binary blobs, Algorithm 2. The truth is fitted so that this reproduces the
+logged estimates at N = 360; every other N is predicted. The same spots are also fitted by
+ours, with the frames' own angles. The LEGO phantom's beads replace the author's, whose
+places are not public; nor are the radiographs.
 
-The experiment's synthetic twin on images has radiographs with beam hardening and photon noise of a
-LEGO phantom whose beads are off its model, and a reconstruction of the first scan to find them.
+The experiment's synthetic twin on images has radiographs with beam hardening and photon
+noise of a LEGO phantom whose beads are off its model, and a reconstruction of the first
+scan to find them.
 
-As in the thesis, the bead positions in the first scan's volume are the model with which the other
-scans are calibrated. Images are taken at constant speed after the run-up, image i at
-i * 360 / (M - 1). The calibration does not know the hidden mount, the true bead positions or the
-spectrum. Mount and tolerance are assumed, not the thesis's.
+As in the thesis, the bead positions in the first scan's volume are the model with which
+the other scans are calibrated. Images are taken at constant speed after the run-up, image
+i at i * 360 / (M - 1). The calibration does not know the hidden mount, the true bead
+positions or the spectrum. Mount and tolerance are assumed, not the thesis's.
 """
 
 from __future__ import annotations
@@ -55,25 +57,29 @@ from flexdt_extensions.studies.runs import Run, attempted, clean, fitted_run
 
 STEPS: Final = np.array([STEP, STEP, STEP, SMALL_STEP, SMALL_STEP, SMALL_STEP])
 PHYSICAL: Final = np.array([1.0, 1.0, 1.0, 1.0, 1.0, -1.0])
-"""The author's offset turns against the phantom: a mount shows in it with its z reversed."""
+"""Signs of the author's offsets: they turn against the phantom, so a mount has its z
+reversed."""
 FITTED: Final = 360
-"""The N whose logs give the truth; the others are predicted."""
+"""Number of projections whose logs give the truth; the others are predicted."""
 ENOUGH: Final = 36
-"""From this N on simulation and logs are compared."""
+"""Least number of projections at which simulation and logs are compared."""
 NOISE_SHARE: Final = 1.5
-"""Noise's weight in the mean square residual: 1 in ten coordinates a frame, 2 in ten distances."""
+"""Weight of noise in the mean square residual: 1 in ten coordinates a frame, 2 in ten
+distances."""
 GROUPS: Final = (slice(0, 6), slice(6, 11))
 """Scans 1 to 6 share a mount, the others another (thesis 6.5)."""
 
 
 @dataclass(frozen=True)
 class GroupTruth:
-    """What a group of scans has in common.
+    """Common truth of a group of scans.
 
     Attributes:
-        values: dO [mm], the phantom's angle in the first frame [deg], and the mount's place in the
+        values: dO [mm], the phantom's angle in the first frame [deg], and the mount's
+            place in the
             world at that frame [mm]; named as in `SIX`.
-        noise_px: for each SOD, what the detections need on top of rounding to agree with the logged
+        noise_px: for each SOD, noise of the detections on top of rounding to agree with
+            the logged
             residuals at N = 360.
     """
 
@@ -83,12 +89,12 @@ class GroupTruth:
 
 @lru_cache
 def scan_names() -> tuple[str, ...]:
-    """Scan1 to Scan11."""
+    """List Scan1 to Scan11."""
     return tuple(author()["real"]["scans"])
 
 
 def poses_of(name: str, angle: FloatArray) -> Poses:
-    """A scan's geometry as the author's code has it, for stage angles (n,) [rad]."""
+    """Make a scan's geometry as the author's code has it, for stage angles (n,) [rad]."""
     real = author()["real"]
     scan = real["scans"][name]
     detector = np.add(scan["detector"], real["detector_added"])
@@ -96,7 +102,8 @@ def poses_of(name: str, angle: FloatArray) -> Poses:
 
 
 def logged(name: str, used: int) -> tuple[FloatArray, float, int]:
-    """A fit of the logs: the six estimates (`SIX`), rms residual [px], iterations."""
+    """Read a fit of the logs: the six estimates (`SIX`), rms residual [px],
+    iterations."""
     number = scan_names().index(name) + 1
     row = thesis()[f"table_A_{number + 4}_scan_{number}"][str(used)]
     after, iterations = next(f[2:] for f in author()["real"]["scans"][name]["fits"] if f[0] == used)
@@ -105,7 +112,7 @@ def logged(name: str, used: int) -> tuple[FloatArray, float, int]:
 
 
 def counts() -> tuple[int, ...]:
-    """The numbers of projections of the logs."""
+    """List the numbers of projections of the logs."""
     return tuple(int(fit[0]) for fit in author()["real"]["scans"]["Scan1"]["fits"])
 
 
@@ -116,7 +123,7 @@ def true_angles(name: str, used: int) -> FloatArray:
 
 
 def spots(name: str, truth: FloatArray, used: int, model: BeadModel) -> FloatArray:
-    """Where the beads are seen (used, k, 2) [px] under a truth (six values of `SIX`)."""
+    """Project the beads under a truth (six values of `SIX`), (used, k, 2) [px]."""
     angle = math.radians(truth[3])
     poses = poses_of(name, true_angles(name, used) + angle)
     poses = replace(
@@ -128,13 +135,14 @@ def spots(name: str, truth: FloatArray, used: int, model: BeadModel) -> FloatArr
 def authors_fit(
     name: str, seen: FloatArray, model: BeadModel, radius_px: float | None = None
 ) -> Iterated:
-    """What the author's code makes of spots (n, k, 2) [px].
+    """Fit spots as the author's code does.
 
     Args:
         name: of the scan.
-        seen: detections, in the order of the beads.
+        seen: detections (n, k, 2) [px], in the order of the beads.
         model: the beads.
-        radius_px: of the blobs, whose centroids are predicted as those of whole pixels; None
+        radius_px: of the blobs, whose centroids are predicted as those of whole pixels;
+            None
             predicts points.
     """
     start = math.radians(author()["real"]["scans"][name]["start_deg"])
@@ -158,13 +166,15 @@ def authors_fit(
 
 
 def _turned(x: float, z: float, angle: float | FloatArray) -> FloatArray:
-    """Unity's (x, 0, z) turned from x to z by an angle [rad], in the world's axes (..., 3)."""
+    """Rotate Unity's (x, 0, z) from x to z by an angle [rad]; in the world's axes
+    (..., 3)."""
     w = (x + 1j * z) * np.exp(1j * np.asarray(angle))
     return np.stack([w.real, w.imag, np.zeros(w.shape)], axis=-1)
 
 
 def binary_centroids(centres: FloatArray, radius_px: float) -> FloatArray:
-    """Centroids (..., 2) of the pixels whose centres lie within a radius of each centre [px]."""
+    """Compute centroids (..., 2) of the pixels whose centres are within a radius of
+    each centre [px]."""
     base = np.floor(centres)
     x, y = np.moveaxis(centres - base, -1, 0)[..., None]
     rows = np.arange(-math.ceil(radius_px), math.ceil(radius_px) + 2)
@@ -178,8 +188,15 @@ def binary_centroids(centres: FloatArray, radius_px: float) -> FloatArray:
 
 
 def physical_truth(group: slice, model: BeadModel) -> GroupTruth:
-    """The truth of a group: fixed point at which the simulated estimates at N = 360 differ from the
-    logged ones by a median of nothing over the group's scans."""
+    """Estimate the truth of a group of scans by fixed-point iteration.
+
+    At it the simulated estimates at N = 360 differ from the logged ones by a median of
+    zero over the group's scans.
+
+    Args:
+        group: of `scan_names`.
+        model: the beads.
+    """
     names = scan_names()[group]
     logs = [logged(name, FITTED) for name in names]
     starts = [author()["real"]["scans"][name]["start_deg"] for name in names]
@@ -267,7 +284,7 @@ def real_runs(
 
 
 def explained(curves: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """How well each scan's logs are explained, over N from 36 up.
+    """Compare each scan's logs with their simulation, over N from 36 up.
 
     Returns:
         One row a scan: rms and largest difference of alpha [deg], largest difference of the rms
@@ -302,38 +319,39 @@ def explained(curves: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 FRAMES: Final = 120
-"""Frames of a scan here (the thesis took 1434 and 360)."""
+"""Number of frames of a scan here (the thesis took 1434 and 360)."""
 COUNTS: Final = (3, 5, 8, 10, 15, 24, 36, 60, 120)
 PHOTONS: Final = 20_000.0
 BLUR_PX: Final = 0.7
 VOXEL_MM: Final = 0.08
-"""Assumed: open-beam photons, blur, voxels of the volume the beads are sought in."""
+"""Assumed: open-beam photons, blur [px], and voxel of the volume in which beads are sought [mm]."""
 TOLERANCE_MM: Final = 0.03
-"""Assumed: how far a bead lies off its model."""
+"""Assumed: standard deviation of a bead from its model [mm]."""
 
 
 def nominal_poses(name: str, frames: int) -> Poses:
-    """Nominal poses of a scan of Table 6.6; angles by the smooth-scan rule."""
+    """Make nominal poses of a scan of Table 6.6; angles by the smooth-scan rule."""
     row = thesis()["table_6_6_scans"][name]
     angle = 2.0 * math.pi * np.arange(frames) / (frames - 1)
     return unity_poses(row["source"], row["object"], row["detector"], angle)
 
 
 def hidden(name: str) -> Offsets:
-    """The mount of a scan: of the size the thesis found at N = 360, in the mount reading."""
+    """Return the mount of a scan: of the thesis's size at N = 360, in the mount
+    reading."""
     row = thesis()["table_A_4_at_360"][name]
     values = {n: row[n] for n in SIX}
     return to_printed_reading(Offsets.from_edge(values), Reading.MOUNT_SHIFT)
 
 
 def hidden_phantom(scene: Scene, model: BeadModel, seed: int) -> tuple[Scene, BeadModel]:
-    """The phantom as it really is: beads off their model by `real.TOLERANCE_MM`."""
+    """Build the true phantom: beads off their model by `real.TOLERANCE_MM`."""
     off = TOLERANCE_MM * np.random.default_rng([seed, 99]).normal(size=model.beads.shape)
     return moved_beads(scene, model, off)
 
 
 def moved_beads(scene: Scene, model: BeadModel, shift: FloatArray) -> tuple[Scene, BeadModel]:
-    """Beads (k, 3) off their model: the solids that are beads move too."""
+    """Move beads (k, 3) off their model; the solids that are beads move too."""
     solids = []
     for solid in scene.solids:
         ball = solid.shape
@@ -348,7 +366,8 @@ def moved_beads(scene: Scene, model: BeadModel, shift: FloatArray) -> tuple[Scen
 def radiographs(
     scene: Scene, cone: ConeVec, beam: EffectiveBeam, seed: Sequence[int]
 ) -> list[Float32Array]:
-    """Line integrals as a scanner's normalisation gives them, one (rows, cols) a frame.
+    """Simulate line integrals as a scanner's normalisation gives them, one (rows, cols) a
+    frame.
 
     Args:
         scene: the solids; every material must be one of the beam's.
@@ -373,7 +392,7 @@ def radiographs(
 
 
 def found_beads(images: Sequence[Float32Array], cone: ConeVec, model: BeadModel) -> BeadModel:
-    """Bead centres in the volume that a scan's images give, sought near the model's.
+    """Reconstruct a scan near the model's beads and find their centres in the volume.
 
     Args:
         images: line integrals of a full turn.
@@ -402,8 +421,21 @@ def found_beads(images: Sequence[Float32Array], cone: ConeVec, model: BeadModel)
 def first_scan(
     name: str, scene: Scene, model: BeadModel, beam: EffectiveBeam, seed: int, frames: int = FRAMES
 ) -> tuple[BeadModel, Calibration]:
-    """Calibrate a scan from the phantom's model, its beads free within their tolerance, reconstruct
-    it with the result, and find the beads."""
+    """Calibrate a scan from the phantom's model, reconstruct it, and find the beads.
+
+    Args:
+        name: of the scan.
+        scene, model: the phantom as designed; its beads are free within their tolerance.
+        beam: effective energies of the images.
+        seed: of beads and noise.
+        frames: images of the scan.
+
+    Returns:
+        The beads found, and the calibration.
+
+    Raises:
+        TwinError: the scan's geometry is not determined.
+    """
     really, _ = hidden_phantom(scene, model, seed)
     poses = nominal_poses(name, frames)
     images = radiographs(really, poses.cone_vec(hidden(name)), beam, [seed, 0])
@@ -430,7 +462,7 @@ def image_runs(
     frames: int = FRAMES,
     counts: Sequence[int] = COUNTS,
 ) -> list[Run]:
-    """Calibrations of one scan from N of its images, with the beads as they were found.
+    """Calibrate one scan from N of its images, with the beads as they were found.
 
     Args:
         name: Scan1 to Scan11.
@@ -464,7 +496,8 @@ def image_runs(
 
 
 def off_truth(found: BeadModel, truth: BeadModel) -> FloatArray:
-    """Distance of each found bead from the true one after the best rigid motion, (k,) [mm]."""
+    """Compare found beads with the true ones after the best rigid motion: distances
+    (k,) [mm]."""
     a = found.beads - found.beads.mean(axis=0)
     b = truth.beads - truth.beads.mean(axis=0)
     u, _, vt = np.linalg.svd(a.T @ b)

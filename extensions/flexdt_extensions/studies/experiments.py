@@ -1,10 +1,11 @@
-"""What the experiments vary: scenarios, phantoms, bead counts, damping, placements, noise.
+"""Variables of the experiments: scenarios, phantoms, bead counts, damping, placements,
+noise.
 
-A `WorkUnit` is one unit of work that can run in any process: one setting in one scenario, for all
-numbers of projections.
+A `WorkUnit` is one unit of work that can run in any process: one setting in one scenario,
+for all numbers of projections.
 
-The thesis's figures as printed, those of its author's public code and logs, and the assumed
-placements come from the package's data files.
+The thesis's figures as printed, those of its author's public code and logs, and the
+assumed placements come from the package's data files.
 """
 
 from __future__ import annotations
@@ -30,30 +31,31 @@ from flexdt.twin.geometry.poses import Poses
 
 @lru_cache
 def thesis() -> Mapping[str, Any]:
-    """All copied figures; `source` gives their origin."""
+    """Load all copied figures; `source` gives their origin."""
     loaded: dict[str, Any] = json.loads(_text("thesis.json"))
     return loaded
 
 
 @lru_cache
 def author() -> Mapping[str, Any]:
-    """Phantoms, scenarios and costs of the author's public code and logs, as the file says."""
+    """Load phantoms, scenarios and costs of the author's public code and logs."""
     return tomllib.loads(_text("author.toml"))
 
 
 @lru_cache
 def placements() -> Mapping[str, Any]:
-    """Object placements of experiment 6.6, labelled assumed."""
+    """Load object placements of experiment 6.6, labelled assumed."""
     return tomllib.loads(_text("placements.toml"))
 
 
 def projection_counts() -> tuple[int, ...]:
-    """The fourteen N of experiments 1 to 3."""
+    """List the fourteen N of experiments 1 to 3."""
     return tuple(int(n) for n in thesis()["projection_counts"])
 
 
 def thesis_row(experiment: str, setting: str) -> Mapping[str, float] | None:
-    """MAE, cost reduction and iterations the thesis reports for a setting, or None."""
+    """Return MAE, cost reduction and iterations the thesis reports for a setting, or
+    None."""
     table = {
         "beads": "table_6_3_beads",
         "phantoms": "table_6_4_phantoms",
@@ -78,7 +80,7 @@ FIDELITIES: Final = ("points", "noisy", "clean", "images")
 """Exact points; points with noise; rendered images without noise; rendered noisy images. In both
 kinds of images the beads' identities are unknown."""
 NOISE_PX: Final = 0.1
-"""Noise of `noisy` points."""
+"""Noise of `noisy` points [px]."""
 EXPERIMENTS: Final = ("beads", "phantoms", "damping", "detector")
 VARIANTS: Final = ("printed", "author")
 """Phantoms and scenarios as the thesis prints them, or as its author's public code has them."""
@@ -119,13 +121,15 @@ class WorkUnit:
 def unity_poses(
     source: npt.ArrayLike, axis: npt.ArrayLike, detector: npt.ArrayLike, angle: FloatArray
 ) -> Poses:
-    """Poses of the thesis's detector: places in Unity's axes (3,) [mm], stage angles (n,) [rad]."""
+    """Make poses of the thesis's detector: places in Unity's axes (3,) [mm], stage
+    angles (n,) [rad]."""
     source, axis, detector = (from_unity(place) for place in (source, axis, detector))
     return Poses.upright(source, axis, detector, PIXEL_MM, angle)
 
 
 def scenario(name: str, frames: int, variant: str = "printed") -> tuple[Poses, Offsets]:
-    """Nominal poses (the thesis's "Unity object", angles 360 n / N) and the truth of a scenario.
+    """Make nominal poses (the thesis's "Unity object", angles 360 n / N) and the truth of
+    a scenario.
 
     Raises:
         UnknownNameError: lists the scenarios.
@@ -142,7 +146,7 @@ def scenario(name: str, frames: int, variant: str = "printed") -> tuple[Poses, O
 
 
 def placement_scenario(setting: str, frames: int) -> tuple[list[Poses], Offsets]:
-    """Poses of each placement of experiment 6.6 for G = 1, 2 or 8, and the truth."""
+    """Make poses of each placement of experiment 6.6 for G = 1, 2 or 8, and the truth."""
     table = placements()
     poses, _ = scenario(table["scenario"], frames)
     out = []
@@ -160,7 +164,7 @@ def tasks(
     seed: int = 1,
     variant: str = "printed",
 ) -> list[WorkUnit]:
-    """All tasks of an experiment.
+    """List all tasks of an experiment.
 
     Args:
         experiment: one of EXPERIMENTS.

@@ -39,9 +39,9 @@ from flexdt_extensions.studies.runs import Run, attempted, geometry_of, run_of
 COUNTS = 5000.0
 """Open-beam photons of a pixel in noisy images (calibration.md)."""
 BLUR_PX = 0.7
-"""Blur of noisy images."""
+"""Blur of noisy images, standard deviation [px]."""
 FINE = 4
-"""fine x fine points in a pixel near a bead."""
+"""Number of points along each side of a pixel near a bead."""
 
 
 @dataclass(frozen=True)
@@ -54,13 +54,14 @@ class Rendering:
 
 
 CLEAN = Rendering(counts=None, blur_px=0.0, fine=1)
-"""Line integrals exactly as the projector makes them: one ray a pixel, no blur, no noise."""
+"""Rendering of exact line integrals: one ray a pixel, no blur, no noise."""
 
 
 def intensities(
     scene: Scene, model: BeadModel, cone: ConeVec, shape: tuple[int, int], fine: int = FINE
 ) -> Float32Array:
-    """Transmitted share of the open beam, (n, rows, cols), integrated over pixels near beads."""
+    """Compute the transmitted share of the open beam, (n, rows, cols), integrated over
+    pixels near beads."""
     out = np.exp(-project_scene(scene, cone, shape))
     if fine <= 1:
         return out
@@ -76,14 +77,16 @@ def intensities(
 
 @dataclass(frozen=True, eq=False)
 class RenderedFrames:
-    """Radiographs of one scan, kept small: counts, or clean line integrals round the object.
+    """Radiographs of one scan, kept small: counts, or clean line integrals round the
+    object.
 
     Attributes:
-        kept: uint16 counts (rows, cols), or float32 line integrals of the part that is not zero.
-        corner: (row, column) where each kept part lies.
-        looks: what was found in each.
+        kept: uint16 counts (rows, cols), or float32 line integrals of the part that is
+            not zero.
+        corner: (row, column) of each kept part.
+        looks: spots found in each.
         shape: (rows, cols).
-        camera: how they were made.
+        camera: noise and blur.
     """
 
     kept: tuple[npt.NDArray[np.generic], ...]
@@ -96,24 +99,24 @@ class RenderedFrames:
         return len(self.kept)
 
     def look(self, detector: SpotFinder) -> list[FrameSpots]:
-        """What was found when the frames were made (the detector is the same)."""
+        """Return the spots found when the frames were made (the detector is the same)."""
         return list(self.looks)
 
     def windows(self, plan: Windows) -> Float32Array:
-        """See `Frames`."""
+        """Cut out windows of line integrals; see `Frames`."""
         n, k = plan.corner.shape[:2]
         out = np.empty((n, k, plan.side, plan.side), dtype=np.float32)
         for i in range(n):
             if self.camera.counts is None:
                 out[i] = crop(self.image(i), plan, i)
             else:
-                # No photon counts as half of one; beside the image there is nothing.
+                # No photon counts as half of one; outside the image there is nothing.
                 counts = crop(self.kept[i], plan, i)
                 out[i] = line_integrals(counts, self.camera.counts)
         return out
 
     def image(self, index: int) -> Float32Array:
-        """Line integrals of one frame, (rows, cols)."""
+        """Compute the line integrals of one frame, (rows, cols)."""
         kept, (top, left) = self.kept[index], self.corner[index]
         if self.camera.counts is not None:
             return line_integrals(kept, self.camera.counts)
@@ -122,7 +125,7 @@ class RenderedFrames:
         return full
 
     def take(self, frames: Sequence[int]) -> RenderedFrames:
-        """Some of the frames."""
+        """Select some of the frames."""
         return RenderedFrames(
             tuple(self.kept[i] for i in frames),
             tuple(self.corner[i] for i in frames),
@@ -133,7 +136,7 @@ class RenderedFrames:
 
 
 def line_integrals(counts: npt.NDArray[np.generic], open_counts: float) -> Float32Array:
-    """-ln(counts / open beam); no photon counts as half of one."""
+    """Compute -ln(counts / open beam); a count of zero is taken as a half."""
     floor = np.maximum(counts.astype(np.float32), np.float32(0.5))
     return np.asarray(np.float32(np.log(open_counts)) - np.log(floor), dtype=np.float32)
 
@@ -186,7 +189,8 @@ def exposures(
     seed: Sequence[int],
     shape: tuple[int, int] = SHAPE,
 ) -> Iterator[npt.NDArray[np.generic]]:
-    """The frames of a scan one after the other: uint16 counts, or line integrals without noise.
+    """Render the frames of a scan one after the other: uint16 counts, or integrals
+    without noise.
 
     Args:
         scene: solids; model: its beads, near which pixels integrate.
@@ -196,7 +200,7 @@ def exposures(
         shape: (rows, cols).
     """
     block = 12
-    # Blur brings in what falls just beside the detector.
+    # Blur brings in signal from just outside the detector.
     margin = math.ceil(4.0 * camera.blur_px)
     rows, cols = shape
     wide = (rows + 2 * margin, cols + 2 * margin)
@@ -215,7 +219,7 @@ def exposures(
 
 
 def photons(expected: Float32Array, rng: np.random.Generator) -> npt.NDArray[np.uint16]:
-    """Poisson counts, (rows, cols)."""
+    """Draw Poisson counts, (rows, cols)."""
     return np.asarray(np.minimum(rng.poisson(expected), 65535), np.uint16)
 
 
@@ -224,7 +228,13 @@ _made: dict[tuple[object, ...], tuple[RenderedFrames, ...]] = {}
 
 
 def image_runs(task: WorkUnit, model: BeadModel, scene: Scene) -> list[Run]:
-    """All numbers of projections of a task in rendered images, identities unknown.
+    """Calibrate rendered images with all numbers of projections of a task, identities
+    unknown.
+
+    Args:
+        task: one setting in one scenario.
+        model: the beads.
+        scene: the phantom.
 
     The images of the largest N are made once; smaller N take every so many of them, as far as
     they divide it (the thesis's do), with the same noise.
@@ -232,6 +242,11 @@ def image_runs(task: WorkUnit, model: BeadModel, scene: Scene) -> list[Run]:
     most = max(task.counts)
 
     def solve(n: int) -> Run:
+        """Calibrate from `n` of the images; without a result the note gives the reason.
+
+        Raises:
+            ValueError: `n` does not divide the largest number.
+        """
         if most % n:
             raise ValueError(f"{n} projections are no even part of {most}")
         everything, truth = geometry_of(task, most)
@@ -253,7 +268,17 @@ def image_runs(task: WorkUnit, model: BeadModel, scene: Scene) -> list[Run]:
 
 
 def _rendered(task: WorkUnit, model: BeadModel, scene: Scene) -> tuple[RenderedFrames, ...]:
-    """Make the radiographs of a task's largest number of projections, or take those of the last."""
+    """Make the radiographs of a task's largest number of projections, or take those of
+    the last.
+
+    Args:
+        task: its phantom, scenario, fidelity and seed.
+        model: the beads.
+        scene: the phantom.
+
+    Returns:
+        One scan for each placement.
+    """
     camera = CLEAN if task.fidelity == "clean" else Rendering()
     most = max(task.counts)
     everything, truth = geometry_of(task, most)

@@ -33,7 +33,7 @@ from flexdt_extensions.studies.experiments import (
 OURS = "ours"
 ALGORITHM_2 = "Algorithm 2"
 COMPARED = ("mae", "cost_reduction_pct", "iterations")
-"""Figures of a setting that stand beside the other method's and the thesis's."""
+"""Figures of a setting that are compared with the other method's and the thesis's."""
 
 
 @dataclass(frozen=True)
@@ -41,17 +41,18 @@ class Run:
     """One solved calibration; errors are absolute, edge units.
 
     Attributes:
-        setting, scenario, projections: which.
+        setting, scenario, projections: of the run.
         identifiable: ours could determine every parameter, and used the data.
         errors: parameter -> |estimate - truth|; empty if not identifiable.
         sigmas: parameter -> stated standard deviation.
         iterations, cost_reduction_pct: of ours.
         success: MAE below the thesis's limit.
         weak: weak and null directions, as text.
-        beside: mae, iterations, cost_reduction_pct, success of the other method on the same tracks,
+        beside: mae, iterations, cost_reduction_pct, success of the other method on the
+            same tracks,
             or empty.
         note: why there is no result.
-        method: whose result this is; the other one is beside it.
+        method: of this result; the other one's is in `beside`.
         failed: it raised an error instead of stating why there is no result.
     """
 
@@ -77,7 +78,7 @@ class Run:
 
     @property
     def figures(self) -> dict[str, float]:
-        """What stands beside the other method's result."""
+        """Figures to compare with the other method's result."""
         return {
             "mae": self.mae,
             "iterations": float(self.iterations),
@@ -86,22 +87,22 @@ class Run:
         }
 
     def to_dict(self) -> dict[str, object]:
-        """JSON-able form; nan becomes null."""
+        """Convert to JSON-able form; nan becomes null."""
         text = json.dumps(asdict(self) | {"mae": self.mae})
         whole: dict[str, object] = json.loads(text, parse_constant=lambda _: None)
         return whole
 
 
 def clean(value: float) -> float | None:
-    """A finite float, or None."""
+    """Return a finite float, or None."""
     return float(value) if math.isfinite(value) else None
 
 
 def attempted(setting: str, scenario: str, n: int, solve: Callable[[int], Run]) -> Run:
-    """Solve a run; one that raises an error has no result, and its note says why.
+    """Run `solve`; an error becomes a run without a result, with the error as its note.
 
     Args:
-        setting, scenario: which.
+        setting, scenario: of the run.
         n: number of projections.
         solve: makes the run from n.
     """
@@ -113,7 +114,8 @@ def attempted(setting: str, scenario: str, n: int, solve: Callable[[int], Run]) 
 
 
 def point_runs(task: WorkUnit, model: BeadModel) -> list[Run]:
-    """All numbers of projections of a task in exact or noisy points (identities known)."""
+    """Fit exact or noisy points with all numbers of projections of a task (identities
+    known)."""
 
     def solve(n: int) -> Run:
         parts, truth = geometry_of(task, n)
@@ -130,7 +132,7 @@ def point_runs(task: WorkUnit, model: BeadModel) -> list[Run]:
 
 
 def geometry_of(task: WorkUnit, n: int) -> tuple[list[Poses], Offsets]:
-    """Nominal poses (one set for each placement) and truth of a task."""
+    """Make nominal poses (one set for each placement) and truth of a task."""
     if task.experiment == "detector":
         return placement_scenario(task.setting, n)
     poses, truth = scenario(task.scenario, n, task.variant)
@@ -147,8 +149,8 @@ def run_of(
 ) -> Run:
     """Compare a fit with the truth, and let Algorithm 2 solve the same tracks.
 
-    In the damping experiment Algorithm 2 is what is studied, so its result is the run's, and ours
-    stands beside it; elsewhere it is the other way round.
+    In the damping experiment the result is that of Algorithm 2, which is studied there,
+    and ours is in `beside`; elsewhere it is the other way round.
     """
     run = fitted_run(task.setting, task.scenario, n, fit, truth, task.limit, note)
     other = None if problem is None else _algorithm_2(task, n, problem, truth)
@@ -196,7 +198,8 @@ def _mae(errors: Mapping[str, float]) -> float:
 
 
 def errors_of(values: dict[str, float], truth: Offsets) -> dict[str, float]:
-    """|value - truth| of each parameter, edge units; whole turns of alpha do not count."""
+    """Compute |value - truth| of each parameter, edge units; whole turns of alpha do
+    not count."""
     edge = truth.to_edge()
     return {
         name: abs(math.remainder(v - edge[name], 360.0) if name == "alpha" else v - edge[name])
@@ -205,7 +208,7 @@ def errors_of(values: dict[str, float], truth: Offsets) -> dict[str, float]:
 
 
 def _algorithm_2(task: WorkUnit, n: int, problem: FitProblem, truth: Offsets) -> Run | None:
-    """What Algorithm 2 makes of the same tracks; nothing if beads are unknowns too."""
+    """Solve the same tracks by Algorithm 2; None if beads are unknowns too."""
     if problem.layout.bead_column >= 0:
         return None
     result = algorithm_2(problem, task.damping)
@@ -219,7 +222,19 @@ def _algorithm_2(task: WorkUnit, n: int, problem: FitProblem, truth: Offsets) ->
 
 
 def rows_of(experiment: str, runs: Sequence[Run]) -> list[dict[str, object]]:
-    """One row a setting, in order of first appearance, with the thesis's figures beside ours."""
+    """Sum up the runs: one row a setting, in order of first appearance, with the thesis's
+    figures.
+
+    Args:
+        experiment: its table of the thesis.
+        runs: of all settings.
+
+    Returns:
+        Rows: counts of runs, successes and failures, means and maxima of MAE, iterations
+            and cost
+        reduction, errors and sigmas by parameter, `beside` of the other method,
+        `thesis_*`.
+    """
     out: list[dict[str, object]] = []
     for setting in dict.fromkeys(r.setting for r in runs):
         some = [r for r in runs if r.setting == setting]
@@ -254,7 +269,7 @@ def rows_of(experiment: str, runs: Sequence[Run]) -> list[dict[str, object]]:
 
 
 def _beside(method: str, figures: Sequence[dict[str, float]]) -> dict[str, object]:
-    """Means of the other method's figures, or nothing."""
+    """Compute means of the other method's figures; empty without any."""
     if not figures:
         return {}
     return {
@@ -272,7 +287,7 @@ def _mean(values: Sequence[float] | npt.NDArray[np.float64]) -> float | None:
 
 
 def summary(experiment: str, fidelity: str, runs: Sequence[Run]) -> dict[str, object]:
-    """The JSON of `flexdt study`."""
+    """Make the JSON of `flexdt study`."""
     return {
         "experiment": experiment,
         "fidelity": fidelity,
@@ -288,7 +303,8 @@ def summary(experiment: str, fidelity: str, runs: Sequence[Run]) -> dict[str, ob
 
 
 def grid(runs: Sequence[Run]) -> tuple[list[str], list[int], FloatArray]:
-    """Mean MAE over scenarios: settings, numbers of projections, (settings, counts) or nan."""
+    """Compute the mean MAE over scenarios: settings, numbers of projections,
+    (settings, counts) or nan."""
     settings = list(dict.fromkeys(r.setting for r in runs))
     counts = sorted({r.projections for r in runs})
     out = np.full((len(settings), len(counts)), np.nan)

@@ -67,12 +67,17 @@ class Cell:
 
 
 def cells(seed: int = 1, noise_px: float = NOISE_PX) -> list[Cell]:
-    """The grid of start errors."""
+    """List the cells of the grid of start errors."""
     return [Cell(mm, deg, 10, "normal-5", seed, noise_px) for mm in START_MM for deg in START_DEG]
 
 
 def basin_runs(cell: Cell, model: BeadModel) -> list[Run]:
-    """All methods on all draws of a cell; the start is the truth plus the error."""
+    """Run all methods on all draws of a cell; the start is the truth plus the error.
+
+    Args:
+        cell: size of the error, draws and noise.
+        model: the beads.
+    """
     out = []
     for draw in range(cell.draws):
         rng = np.random.default_rng([cell.seed, int(cell.mm * 10), int(cell.deg), draw])
@@ -101,7 +106,7 @@ def basin_runs(cell: Cell, model: BeadModel) -> list[Run]:
 
 @dataclass(frozen=True, eq=False)
 class _Draw:
-    """What a method gets: measured points, beads, poses, where to start, and dice."""
+    """Input of a method: measured points, beads, poses, start and random numbers."""
 
     tracks: FloatArray
     model: BeadModel
@@ -161,13 +166,13 @@ def _solve(method: str, draw: _Draw) -> _Found:
 
 KILOVOLTS = 90.0
 LOOP_RADIUS_MM, LOOP_INSET_MM = 2.0, 3.0
-"""Beads of the author's code, and how far inside the faces they stand."""
+"""Radius of the beads of the author's code, and their distance from the faces [mm]."""
 FIDELITIES: Final[Mapping[str, tuple[str, ...]]] = {
     **dict.fromkeys(EXPERIMENTS, ALL_FIDELITIES),
     "real": ("points", "noisy", "images"),
     "basin": ("noisy", "points"),
 }
-"""What each experiment can be run on, the default first."""
+"""Fidelities of each experiment, the default first."""
 
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 """`map`, or that of an executor."""
@@ -191,14 +196,16 @@ def run_study(
 
     Args:
         experiment: beads, phantoms, damping, detector, real or basin.
-        fidelity: points, noisy, clean or images; None is the experiment's own (points; basin:
+        fidelity: points, noisy, clean or images; None is the experiment's own (points;
+            basin:
             noisy).
         out: folder for summary.json, tables and heat maps; None writes nothing.
         jobs: processes; None is one for each core.
         scheduler: address of a dask scheduler to use instead of own processes.
         counts: numbers of projections; None is the thesis's. basin has one.
         seed: of all noise.
-        variant: phantoms and scenarios of beads, phantoms and damping as the thesis prints them
+        variant: phantoms and scenarios of beads, phantoms and damping as the thesis
+            prints them
             (printed), or as its author's public code has them (author).
         tell: called with a line of text after each task.
 
@@ -207,7 +214,8 @@ def run_study(
 
     Raises:
         UnknownNameError: no such experiment, or it has no such fidelity or variant.
-        TwinError: counts were given for basin; dask.distributed is not installed; `out` was given
+        TwinError: counts were given for basin; dask.distributed is not installed; `out`
+            was given
             and matplotlib is not installed.
         CommandError: the scheduler cannot be reached.
     """
@@ -249,7 +257,7 @@ def _require(problem: str, name: str, allowed: Iterable[str]) -> None:
 
 
 def _collected(results: Iterable[list[Run]], names: Sequence[str], say: Tell) -> list[Run]:
-    """The runs of all tasks, with a line of progress for each task."""
+    """Collect the runs of all tasks, with a line of progress for each task."""
     runs = []
     for i, (name, some) in enumerate(zip(names, results, strict=True)):
         runs += some
@@ -259,7 +267,7 @@ def _collected(results: Iterable[list[Run]], names: Sequence[str], say: Tell) ->
 
 
 def run_task(task: WorkUnit) -> list[Run]:
-    """All runs of one task; a plain function, so that it can be sent to another process."""
+    """Run one task; a plain function, so that it can be sent to another process."""
     phantom = load_phantom(task.phantom) if task.variant == "printed" else authors(task.phantom)
     model = bead_model(phantom)
     if task.fidelity in ("points", "noisy"):
@@ -270,7 +278,7 @@ def run_task(task: WorkUnit) -> list[Run]:
 
 
 def authors(name: str) -> Phantom:
-    """A cuboid with K beads, `NAME-K`, as the author's public code makes it."""
+    """Build a cuboid with K beads, `NAME-K`, as the author's public code makes it."""
     cuboid, beads = name.split("-")
     w, b, h = author()["cuboids"][cuboid]
     return cuboid_with_beads(
@@ -280,12 +288,13 @@ def authors(name: str) -> Phantom:
 
 
 def basin_task(cell: Cell) -> list[Run]:
-    """All methods in one cell of start errors."""
+    """Run all methods in one cell of start errors."""
     return basin_runs(cell, bead_model(load_phantom(cell.phantom)))
 
 
 def _basin(spread: Map, say: Tell, fidelity: str, seed: int) -> tuple[list[Run], Document]:
-    """Success against the start's error, for Algorithm 2, our fit, and unknown identities."""
+    """Run all cells: success against the start's error, for Algorithm 2, our fit,
+    unknown identities."""
     work = cells(seed=seed, noise_px=0.0 if fidelity == "points" else NOISE_PX)
     runs = _collected(spread(basin_task, work), [cell.name for cell in work], say)
     shares = {}
@@ -300,7 +309,8 @@ def _basin(spread: Map, say: Tell, fidelity: str, seed: int) -> tuple[list[Run],
 def real_task(
     task: tuple[str, real.GroupTruth, int, bool, Sequence[int] | None],
 ) -> tuple[list[Run], Document]:
-    """One scan of experiment 4: (scan, truth of its group, seed, exact points, counts)."""
+    """Run one scan of experiment 4: (scan, truth of its group, seed, exact points,
+    counts)."""
     name, truth, seed, exact, used = task
     model = bead_model(load_phantom("lego"))
     return real.real_runs(name, model, truth, seed, exact=exact, used=used)
@@ -309,7 +319,19 @@ def real_task(
 def _real(
     spread: Map, say: Tell, fidelity: str, seed: int, used: Sequence[int] | None
 ) -> tuple[list[Run], Document]:
-    """The author's 242 fits of real scans beside their simulation and ours."""
+    """Compare the author's 242 fits of real scans with their simulation and ours.
+
+    Args:
+        spread: `map`, or that of an executor.
+        say: called with a line of text after each scan.
+        fidelity: points or noisy.
+        seed: of the noise.
+        used: numbers of projections; None is the logs'.
+
+    Returns:
+        The runs, and `assumed`, `logs_source`, `truths`, `curves` and `explained` of the
+        document.
+    """
     model = bead_model(load_phantom("lego"))
     truths = [real.physical_truth(group, model) for group in real.GROUPS]
     names = real.scan_names()
@@ -347,7 +369,7 @@ def _real(
 
 
 def lego_beam() -> EffectiveBeam:
-    """Effective energies of the tube's beam behind the LEGO phantom."""
+    """Compute effective energies of the tube's beam behind the LEGO phantom."""
     names = sorted({solid.material for solid in load_phantom("lego").scene.solids})
     signal, noise = weights_of(Chain(Detector()), KILOVOLTS)
     longest = [60.0 if name == "abs" else 2.5 for name in names]
@@ -355,7 +377,7 @@ def lego_beam() -> EffectiveBeam:
 
 
 def real_images_task(task: tuple[str, BeadModel, int, int, Sequence[int]]) -> list[Run]:
-    """One scan: (name, beads as found, seed, frames, counts)."""
+    """Run one scan on images: (name, beads as found, seed, frames, counts)."""
     name, found, seed, frames, counts = task
     phantom = load_phantom("lego")
     return real.image_runs(
@@ -372,7 +394,8 @@ def real_images_runs(
     scans: Sequence[str] | None = None,
     frames: int = real.FRAMES,
 ) -> tuple[list[Run], Document]:
-    """Experiment 4 on images: the first scan gives the beads, all are calibrated with them.
+    """Run experiment 4 on images: the first scan gives the beads, all are calibrated with
+    them.
 
     Args:
         spread: `map`, or that of an executor.
@@ -381,6 +404,9 @@ def real_images_runs(
         counts: numbers of images to calibrate from.
         scans: names; None is all eleven.
         frames: images of a scan.
+
+    Returns:
+        The runs, and `beads_off_truth_mm` of the document.
     """
     phantom = load_phantom("lego")
     model = bead_model(phantom)

@@ -1,4 +1,4 @@
-"""`flexdt study`: repeats the thesis's experiments and prints its figures beside ours."""
+"""`flexdt study`: repeats the thesis's experiments and prints its figures with ours."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ def write_study(out: Path, document: Mapping[str, Any], runs: Sequence[Run]) -> 
     Args:
         out: the folder.
         document: the JSON of `flexdt study`.
-        runs: what it was made of.
+        runs: of the document.
     """
     out.mkdir(parents=True, exist_ok=True)
     write_whole(out / "summary.json", json.dumps(document, indent=1) + "\n")
@@ -42,7 +42,15 @@ def write_study(out: Path, document: Mapping[str, Any], runs: Sequence[Run]) -> 
 
 
 def _error_charts(document: Mapping[str, Any], runs: Sequence[Run]) -> dict[str, str]:
-    """Errors by setting and number of projections, and by setting and parameter."""
+    """Plot errors by setting and number of projections, and by setting and parameter.
+
+    Args:
+        document: of the study.
+        runs: its runs.
+
+    Returns:
+        Name -> SVG.
+    """
     settings, counts, values = grid(runs)
     title = f"{document['experiment']}, {document['fidelity']}: MAE"
     parameters = next((list(run.errors) for run in runs if run.errors), [])
@@ -64,7 +72,7 @@ def _error_charts(document: Mapping[str, Any], runs: Sequence[Run]) -> dict[str,
 
 
 def _basin_charts(document: Mapping[str, Any]) -> list[str]:
-    """One heat map of successes for each method."""
+    """Plot one heat map of successes for each method."""
     rows = [f"{v:g} mm" for v in document["start_mm"]]
     columns = [f"{v:g} deg" for v in document["start_deg"]]
     return [
@@ -77,7 +85,14 @@ def _basin_charts(document: Mapping[str, Any]) -> list[str]:
 
 
 def _real_charts(document: Mapping[str, Any]) -> list[str]:
-    """The logged fits beside their simulation: alpha against N for each scan, tables."""
+    """Plot the logged fits with their simulation: alpha against N for each scan, tables.
+
+    Args:
+        document: of the study.
+
+    Returns:
+        HTML of lines, charts and tables.
+    """
     charts = ["".join(paragraph(f"{line}.") for line in real_lines(document))]
     for curve in document["curves"]:
         rows = curve["by_projections"]
@@ -101,8 +116,15 @@ def _real_charts(document: Mapping[str, Any]) -> list[str]:
 
 
 def open_directions(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]] | None:
-    """For each row: runs with a weak direction, and the largest mean sigma with its parameter; None
-    where no row has a weak run that was solved."""
+    """Sum up weak directions; None where no row has a weak run that was solved.
+
+    Args:
+        rows: of the study.
+
+    Returns:
+        For each row: runs with a weak direction, and the largest mean sigma with its
+        parameter.
+    """
     if not any(row["weak"] > row["unidentifiable"] for row in rows):
         return None
     out = []
@@ -115,7 +137,12 @@ def open_directions(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]] 
 
 
 def real_lines(document: Mapping[str, Any]) -> list[str]:
-    """What explains the logged fits of real scans, in sentences; nothing where not studied."""
+    """Describe in sentences how the logged fits of real scans are explained; none where
+    not studied.
+
+    Args:
+        document: of the study.
+    """
     found = document.get("explained")
     if not found:
         return []
@@ -137,7 +164,8 @@ def real_lines(document: Mapping[str, Any]) -> list[str]:
 
 
 def curve_table(curve: Mapping[str, Any]) -> str:
-    """One scan against N: logged, simulated as the author fits, simulated with right angles."""
+    """Make a table of one scan against N: logged, simulated as the author fits, with
+    right angles."""
     names = ("alpha", "dO_z", "tau_x", "tau_z")
     return table(
         ["N", *(f"{n}: logged, simulated ({UNITS[n]})" for n in names), "right angles: alpha (deg)",
@@ -154,7 +182,12 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def report(document: Mapping[str, Any], *charts: str) -> str:
-    """One HTML page."""
+    """Build one HTML page.
+
+    Args:
+        document: of the study.
+        charts: SVG or HTML.
+    """
     rows = [
         [
             r["setting"], r["runs"], r["success"], r["unidentifiable"], r["mae"], r["mae_max"],
@@ -196,7 +229,7 @@ def heat_map(
     good_below: float | None = None,
     good_from: float = 1.0,
 ) -> str:
-    """A table of numbers, green where they are good and red where not.
+    """Draw a table of numbers, green where they are good and red where not.
 
     Args:
         values: (rows, columns); nan is white.
