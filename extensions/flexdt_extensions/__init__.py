@@ -1,1 +1,2 @@
-"""What is built on flexdt's public names: each subpackage is one subject and stands by itself."""
+"""Extensions built on flexdt's public names: each subpackage is one subject and
+independent."""

@@ -1,4 +1,5 @@
-"""A thread that watches a dask cluster while workers are wanted, and says what it waits for."""
+"""A thread that watches a dask cluster during the work, and prints the reason of a
+wait."""
 
 from __future__ import annotations
 
@@ -10,7 +11,7 @@ from flexdt.extending import CommandError, note
 from flexdt_extensions.slurm_jobs import Tend
 
 EVERY_S: Final = 10.0
-"""Between two looks at the workers, and so between lines of one that waits."""
+"""Interval between looks at the workers, and so between lines of a wait [s]."""
 
 
 class ClusterWatch(threading.Thread):
@@ -18,7 +19,7 @@ class ClusterWatch(threading.Thread):
 
     Args:
         client: of dask.
-        tend: what there is to do and to say.
+        tend: called at each look; acts on the workers and prints.
 
     Attributes:
         error: that ended the work, which then ends with cancelled futures.

@@ -2,14 +2,15 @@
 
 Functions and their arguments must be picklable, because they travel to another process.
 
-A cluster's workers come from a SLURM queue (`slurm_jobs`), by the script that dask-jobqueue writes:
-each job takes its share of a node, and each worker has one thread. While a cluster has no workers,
-`cluster_watch` says what is waited for.
+A cluster's workers come from a SLURM queue (`slurm_jobs`), by the script that
+dask-jobqueue writes: each job takes its share of a node, and each worker has one thread.
+While a cluster has no workers, `cluster_watch` prints the reason.
 
-Items travel to the workers and their arrays travel back, so nodes need flexdt installed but no
-shared folder.
+Items travel to the workers and their arrays travel back, so nodes need flexdt installed
+but no shared folder.
 
-The TOML files of batches and SLURM jobs are read here; errors name file, key path and value.
+The TOML files of batches and SLURM jobs are read here; errors name file, key path and
+value.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from flexdt_extensions.slurm_jobs import REFUSED, SlurmJobs, Tend, lifetime_s
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The content of a TOML file.
+    """Read the content of a TOML file.
 
     Raises:
         CommandError: no TOML.
@@ -50,7 +51,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def problems_of(name: str, error: ValidationError) -> list[str]:
-    """What is wrong in a document, line by line, with key paths."""
+    """List the problems of a document, one line each, with key paths."""
     lines = []
     for e in error.errors(include_url=False, include_context=False):
         path = ".".join(str(part) for part in e["loc"]) or "plan"
@@ -65,11 +66,12 @@ SINGLE: Final[Mapping[str, str]] = {f"{name}_THREADS": "1" for name in _NUMBERED
 """Environment of workers that share a machine: one thread each, so sums have one order."""
 
 SCHEDULER_S = 10.0
-"""How long to try to reach a dask scheduler."""
+"""Time limit for reaching a dask scheduler [s]."""
 
 
 def executor(jobs: int | None, scheduler: str | None) -> AbstractContextManager[Executor | None]:
-    """Something to map tasks with: a dask scheduler, own processes, or None for this process."""
+    """Choose an executor to map tasks with: a dask scheduler, own processes, or None
+    for this process."""
     if scheduler is not None:
         return dask_executor(scheduler)
     return nullcontext() if _count(jobs) <= 1 else processes(jobs)
@@ -117,19 +119,24 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def dask_executor(address: Any, tend: Tend | None = None) -> Iterator[Executor]:
-    """The workers of a dask scheduler.
+    """Connect to the workers of a dask scheduler.
 
     Args:
         address: of a scheduler, or a cluster object of dask.
-        tend: what there is to do and to say about the workers while the work goes on; None says
-            that there are none.
+        tend: called at each look at the workers while the work goes on; None prints where
+            there are
+            none.
+
+    Yields:
+        Their executor.
 
     Raises:
-        TwinError: dask.distributed is not installed, or what is given is no address.
-        CommandError: the scheduler cannot be reached or is lost, or workers die of a task.
+        TwinError: dask.distributed is not installed, or `address` is not valid.
+        CommandError: the scheduler cannot be reached or is lost, or workers die of a
+            task.
     """
     distributed = package("distributed", "a scheduler", "batch", "flexdt-extensions")
-    # What these log of a lost scheduler comes as one line from here.
+    # Their messages about a lost scheduler are replaced by one line from here.
     for name in ("distributed", "distributed.client", "tornado.application", "asyncio"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
@@ -155,7 +162,8 @@ def dask_executor(address: Any, tend: Tend | None = None) -> Iterator[Executor]:
 
 
 def _told(error: Exception, address: Any, killed: type[Exception]) -> CommandError | None:
-    """What an error of dask's means for people; None: it is none of dask's."""
+    """Make the error for people from an error of dask's; None: it is not one of
+    dask's."""
     if isinstance(error, CancelledError):
         return CommandError(
             f"the dask scheduler at {address} is lost; once there is one, run the command again to "
@@ -176,10 +184,10 @@ def _none_at(address: Any) -> str:
 
 @dataclass(frozen=True)
 class Slurm:
-    """What to ask SLURM for.
+    """Request to SLURM.
 
     Attributes:
-        jobs: how many jobs.
+        jobs: number of jobs.
         cores: of each; as many workers.
         memory: of each job, e.g. "8GiB".
         walltime: of each job, HH:MM:SS.
@@ -200,7 +208,8 @@ class Slurm:
 
 
 def read_slurm(path: Path) -> Slurm:
-    """What to ask SLURM for from a TOML file with the names of `Slurm`; the others keep defaults.
+    """Read a request to SLURM from a TOML file with the names of `Slurm`; the others keep
+    defaults.
 
     Raises:
         CommandError: no TOML, or every problem with its name.
@@ -213,7 +222,7 @@ def read_slurm(path: Path) -> Slurm:
 
 
 def job_script(wanted: Slurm) -> str:
-    """The script each SLURM job runs, as dask-jobqueue writes it.
+    """Write the script each SLURM job runs, as dask-jobqueue does.
 
     Raises:
         TwinError: dask-jobqueue is not installed.
@@ -224,7 +233,13 @@ def job_script(wanted: Slurm) -> str:
 
 @contextmanager
 def slurm_executor(wanted: Slurm) -> Iterator[Executor]:
-    """The workers of SLURM jobs that this submits, and cancels at the end.
+    """Submit SLURM jobs and connect to their workers; cancel the jobs at the end.
+
+    Args:
+        wanted: number, size and queue of the jobs.
+
+    Yields:
+        The workers' executor.
 
     Raises:
         TwinError: dask-jobqueue is not installed, or `sbatch` is not here.
@@ -249,7 +264,8 @@ def slurm_executor(wanted: Slurm) -> Iterator[Executor]:
 
 
 def slurm_workers(path: Path) -> AbstractContextManager[Executor]:
-    """As `slurm_executor`, for what a TOML file asks; see `read_slurm`."""
+    """Start the workers of a TOML file's request; see `slurm_executor` and
+    `read_slurm`."""
     return slurm_executor(read_slurm(path))
 
 
@@ -270,6 +286,15 @@ def _same_signals() -> Iterator[None]:
 
 
 def _cluster(wanted: Slurm) -> Any:
+    """Make dask-jobqueue's cluster, without workers.
+
+    Args:
+        wanted: size, queue and set-up of each job; workers leave before its walltime
+            ends.
+
+    Raises:
+        TwinError: dask-jobqueue is not installed.
+    """
     with _same_signals():
         jobqueue = package("dask_jobqueue", "SLURM", "slurm", "flexdt-extensions")
     lifetime = lifetime_s(wanted.walltime)

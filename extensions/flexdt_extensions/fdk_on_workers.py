@@ -1,13 +1,16 @@
-"""FDK by workers anywhere: each reads the frames, makes one slab and writes it where all see it.
+"""FDK by workers anywhere: each reads the frames, makes one slab and writes it to a
+shared folder.
 
-The data set and the volume lie in folders that every worker sees under the same path. The slabs are
-the same for any number of workers. A slab's file is there only when it is whole, so the folder
-itself says what is done: after any end the same command makes the slabs that are missing. The
-folder's name holds a digest of what is asked for, so different requests never mix.
+The data set and the volume are in folders that every worker sees under the same path. The
+slabs are the same for any number of workers. A slab's file appears only when it is
+complete, so the folder itself records the progress: after any end the same command makes
+the missing slabs. The folder's name holds a digest of the request, so different requests
+never mix.
 
-The volume is OME-NGFF 0.5 (Zarr 3), written slab by slab, in any order, by any process. A slab is a
-fixed number of layers. At each resolution it is a file (a shard) for every 256 rows, which no other
-slab touches: slabs need no lock, and their bytes do not depend on who writes them, or when.
+The volume is OME-NGFF 0.5 (Zarr 3), written slab by slab, in any order, by any process. A
+slab is a fixed number of layers. At each resolution it is a file (a shard) for every 256
+rows, which no other slab touches: slabs need no lock, and their bytes do not depend on
+the writer, or on the time.
 """
 
 from __future__ import annotations
@@ -40,31 +43,34 @@ from flexdt.twin.reconstruction import Truncation, fdk_parts
 
 Sink = Callable[[Float32Array], None]
 CHUNK: Final = 64
-"""Voxels along each side of a chunk."""
+"""Number of voxels along each side of a chunk."""
 ROWS: Final = 4 * CHUNK
-"""Of a shard at most: what is compressed at a time is held two or three times."""
+"""Largest number of rows of a shard: data under compression are held two or three
+times."""
 SLAB_BYTES: Final = 128 << 20
-"""Of a slab at most; one layer if that is more."""
+"""Largest size of a slab [bytes]; one layer if that is more."""
 SLABS: Final = 256
-"""Most slabs of a large volume, whose slabs are larger instead: each reads all frames again."""
+"""Largest number of slabs of a large volume, whose slabs are larger instead: each
+reads all frames again."""
 COARSEST: Final = 128
-"""Voxels along the longest side below which there is no coarser resolution."""
+"""Number of voxels along the longest side below which there is no coarser resolution."""
 
 
 def opened(path: Path) -> Any:
-    """The group of a volume that is there."""
+    """Open the group of an existing volume."""
     return zarr.open_group(path, mode="r")
 
 
 def move(made: Path, path: Path) -> None:
-    """Give a whole volume its name, in place of one that is there."""
+    """Move a complete volume to its name, in place of an earlier one."""
     if (path / "zarr.json").is_file():
         shutil.rmtree(path)
     os.replace(made, path)
 
 
 def slabs(grid: Grid) -> list[tuple[int, int]]:
-    """Layers (first, last) of each slab: a power of two, so that slabs can be halved."""
+    """List the layers (first, last) of each slab: a power of two, so that slabs can be
+    halved."""
     each, (nz, ny, nx) = CHUNK, grid.shape
     while each > 1 and 4 * each * ny * nx > max(SLAB_BYTES, grid.bytes // SLABS):
         each //= 2
@@ -72,7 +78,7 @@ def slabs(grid: Grid) -> list[tuple[int, int]]:
 
 
 def levels(grid: Grid) -> list[tuple[int, int, int]]:
-    """Shape (z, y, x) of each resolution, halved from one to the next."""
+    """List the shape (z, y, x) of each resolution, halved from one to the next."""
     first, last = slabs(grid)[0]
     shape = grid.shape
     shapes = [shape]
@@ -83,7 +89,15 @@ def levels(grid: Grid) -> list[tuple[int, int, int]]:
 
 
 def create(path: Path, grid: Grid) -> Any:
-    """The group with its empty arrays; returns it."""
+    """Create the group with its empty arrays, one for each resolution.
+
+    Args:
+        path: of the group.
+        grid: of the volume.
+
+    Returns:
+        The Zarr group.
+    """
     axes = [{"name": name, "type": "space", "unit": "millimeter"} for name in "zyx"]
     datasets: list[Any] = []
     about: Any = {"name": "attenuation [1/mm]", "axes": axes, "datasets": datasets}
@@ -120,7 +134,8 @@ def put(group: Any, grid: Grid, slab: int, values: Float32Array) -> None:
 
 
 def put_whole(path: Path, grid: Grid, slab: int, values: Float32Array) -> None:
-    """As `put`, in another process: files appear only when whole, that of `mark` as the last.
+    """Write a slab as `put`, from another process: files appear when complete, that of
+    `mark` last.
 
     Raises:
         OSError: it cannot be written; FileNotFoundError where the store is no longer there.
@@ -138,12 +153,13 @@ def put_whole(path: Path, grid: Grid, slab: int, values: Float32Array) -> None:
 
 
 def mark(path: Path, slab: int) -> Path:
-    """The file that is there when the slab is whole."""
+    """Return the file that exists when the slab is complete."""
     return path / "0" / "c" / str(slab) / "0" / "0"
 
 
 def halved(values: Float32Array) -> Float32Array:
-    """Means of 2 x 2 x 2 voxels; where a side is odd, its last layer counts twice."""
+    """Compute means of 2 x 2 x 2 voxels; where a side is odd, its last layer counts
+    twice."""
     odd = [(0, n % 2) for n in values.shape]
     even = np.pad(values, odd, "edge") if any(n for _, n in odd) else values
     halves = slice(0, None, 2), slice(1, None, 2)
@@ -157,7 +173,14 @@ class VolumeFormat:
 
     @staticmethod
     def write(part: Path, path: Path, grid: Grid) -> Iterator[Sink]:
-        """Yield what takes the layers in order; then `part` is whole and becomes `path`."""
+        """Yield a function that takes the layers in order; at the end `part` is complete
+        and becomes `path`.
+
+        Args:
+            part: temporary path.
+            path: of the volume.
+            grid: of the volume.
+        """
         group, todo = create(part, grid), list(enumerate(slabs(grid)))
         held: list[Float32Array] = []
 
@@ -174,7 +197,8 @@ class VolumeFormat:
 
     @staticmethod
     def read(path: Path) -> tuple[Float32Array, float, Sequence[float], bool]:
-        """Values, voxel [mm], centre (x, y, z) [mm] of the first one, and that it is its."""
+        """Read values, voxel [mm] and the centre (x, y, z) [mm] of the first voxel,
+        marked by True."""
         group = opened(path)
         (scale,) = group.attrs["ome"]["multiscales"]
         size, place = scale["datasets"][0]["coordinateTransformations"]
@@ -187,15 +211,15 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True, eq=False)
 class SlabWork:
-    """What a worker needs to know of a volume; it travels with each slab.
+    """Data of a volume for a worker; they travel with each slab.
 
     Attributes:
         parts: gives the line integrals of all views in parts.
         cone_vec: of all views.
         shape: of an image, (rows, cols).
-        grid: of the whole volume.
+        grid: of the complete volume.
         window: of the ramp filter.
-        truncation: what lies beyond the panel's edges.
+        truncation: assumption beyond the panel's edges.
     """
 
     parts: Callable[[], Iterable[Float32Array]]
@@ -207,14 +231,20 @@ class SlabWork:
 
 
 def make_slab(work: SlabWork, slab: int, store: Path, made_by: str) -> bool:
-    """Make and write one slab; a plain function, so that it can be sent to another process.
+    """Make and write one slab; a plain function, so that it can be sent to another
+    process.
+
+    Args:
+        work: the volume.
+        slab: number of the slab.
+        store: folder of the volume.
+        made_by: version of flexdt of the requesting process.
 
     Returns:
         Whether a CUDA device made it.
 
     Raises:
-        TwinError: this process has another version of flexdt than the one that asks, or too little
-            memory.
+        TwinError: this process has another version of flexdt, or too little memory.
         DatasetError: a frame cannot be read here.
         OSError: the slab cannot be written here.
     """
@@ -241,15 +271,18 @@ def fdk_on_workers(
     pool: Executor,
     tell: Callable[[float, float], None],
 ) -> list[str]:
-    """Make the slabs that are missing, then the file; returns what is doubtful.
+    """Make the missing slabs, then the file.
 
     Args:
         views: the frames, of a data set in a folder.
         grid: of the volume.
         request: the volume, by FDK.
-        out: the file; the slabs lie in a hidden folder beside it until all are there.
+        out: the file; the slabs are in a hidden folder next to it until all are complete.
         pool: of the workers.
         tell: called with slabs done and slabs to do.
+
+    Returns:
+        Doubts about the volume.
 
     Raises:
         LimitError: another algorithm, or a data set in memory.
@@ -268,7 +301,7 @@ def fdk_on_workers(
         asdict(replace(request, png=False)), asdict(grid), views.cone_vec.rows.tolist(),
         [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats],
     )  # fmt: skip
-    # Workers compute for themselves what this process has computed of the data set.
+    # Workers compute derived values of the data set themselves.
     sent = replace(views, dataset=replace(data))
     truncation = views.truncation
     work = SlabWork(sent.parts, views.cone_vec, views.shape, grid, request.window, truncation)
@@ -296,9 +329,11 @@ def fdk_on_workers(
 
 
 def as_made(running: Sequence[Future[_T]]) -> Generator[_T, None, None]:
-    """Results in the order in which they come; what one of the tasks raises cancels the others.
+    """Yield results in the order in which they come; an error of one task cancels the
+    others.
 
-    Who may fail between two results closes it, so that this cancels the others, too.
+    A caller that may fail between two results closes it, so that this cancels the others,
+    too.
     """
     try:
         for future in as_completed(running):
@@ -309,7 +344,8 @@ def as_made(running: Sequence[Future[_T]]) -> Generator[_T, None, None]:
 
 
 def folder_of(out: Path, identity: object) -> tuple[Path, str]:
-    """The folder beside `out` for what is being made of it, and this version of flexdt."""
+    """Name the folder next to `out` for the unfinished volume; returns flexdt's
+    version as well."""
     made_by = version("flexdt")
     text = json.dumps([made_by, identity], sort_keys=True, default=str)
     digest = hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -317,7 +353,8 @@ def folder_of(out: Path, identity: object) -> tuple[Path, str]:
 
 
 def same_version(made_by: str) -> None:
-    """Check, on a worker, that it has the version of flexdt of the one that asks.
+    """Check, on a worker, that it has the same version of flexdt as the requesting
+    process.
 
     Raises:
         TwinError: it has another.
@@ -327,7 +364,7 @@ def same_version(made_by: str) -> None:
 
 
 def _finish(store: Path, out: Path, grid: Grid) -> None:
-    """The file of a store that is whole."""
+    """Write the file of a complete store."""
     if out.suffix.lower() == ".zarr":
         move(store, out)
         return

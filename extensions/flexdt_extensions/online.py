@@ -36,23 +36,24 @@ from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
 
 FIRST = 3
-"""Frames before the first identification is tried."""
+"""Number of frames before the first identification is tried."""
 GATE_SIGMAS = 6.0
 GATE_PX = 3.0
-"""A spot belongs to a bead within GATE_PX of its prediction, plus GATE_SIGMAS of that."""
+"""Largest distance of a spot from its bead's prediction [px], plus GATE_SIGMAS of
+that."""
 
 
 @dataclass(frozen=True, eq=False)
 class Online:
-    """What is known after some frames.
+    """State of an online calibration after some frames.
 
     Attributes:
-        model, free, start, priors: what is calibrated; see `estimate_geometry`.
+        model, free, start, priors: of the calibration; see `estimate_geometry`.
         poses: nominal pose of each frame so far, or None before the first.
         detections: of each frame so far.
         tracks, covariances, bias: assigned positions, (n, k, ...).
         fit: the present estimate, None until the beads could be distinguished.
-        updates: how often the fit was renewed.
+        updates: number of renewals of the fit.
     """
 
     model: BeadModel
@@ -68,13 +69,14 @@ class Online:
     priors: Mapping[str, float]
 
     def sigmas(self) -> dict[str, float]:
-        """Present standard deviation of every parameter, edge units; inf where not determined."""
+        """Return the standard deviation of every parameter, edge units; inf where not
+        determined."""
         if self.fit is None or not self.fit.identifiable:
             return dict.fromkeys(self.free, math.inf)
         return self.fit.sigmas
 
     def done(self, tolerance: Mapping[str, float]) -> bool:
-        """Whether every named parameter's sigma is at most its tolerance (edge units).
+        """Check that every named parameter's sigma is at most its tolerance (edge units).
 
         Raises:
             UnknownNameError: a name that is not estimated.
@@ -86,7 +88,8 @@ class Online:
 
 
 def require_estimated(free: Sequence[str], tolerance: Mapping[str, float]) -> None:
-    """Refuse tolerances for what is not estimated, and none at all; raises as `Online.done`."""
+    """Check that there are tolerances, all for estimated parameters; raises as
+    `Online.done`."""
     if not tolerance:
         raise TwinError("no tolerance given; allowed: parameter -> sigma", {"allowed": list(free)})
     for name in tolerance:
@@ -100,15 +103,17 @@ def begin(
     start: Offsets = NOMINAL,
     priors: Mapping[str, float] | None = None,
 ) -> Online:
-    """An online calibration before its first frame.
+    """Begin an online calibration, before its first frame.
 
     Args:
-        phantom: what is scanned.
+        phantom: the scanned one.
         free: parameters to estimate.
         start: offsets to begin with, on which the priors are centred.
-        priors: standard deviations of other offsets [mm, deg, 1]; see `fit.priors`. None: they are
-            exactly known, and sigmas are those of the images' noise alone, which is what more
-            frames can lower.
+        priors: standard deviations of other offsets [mm, deg, 1]; see `fit.priors`. None:
+            they are
+            exactly known, and sigmas are those of the images' noise alone, which more
+            frames can
+            lower.
     """
     require_names(free)
     widths = require_widths(priors or {})
@@ -121,15 +126,15 @@ def begin(
 
 
 def feed(state: Online, pose: Poses, detections: Detections) -> Online:
-    """One more frame.
+    """Add one more frame.
 
     Args:
-        state: what was known.
+        state: before the frame.
         pose: nominal pose of the frame (one).
-        detections: what was found in it.
+        detections: spots found in it.
 
     Returns:
-        What is known now.
+        The state with this frame.
 
     Raises:
         TwinError: `pose` is not one frame.
@@ -156,7 +161,7 @@ def feed(state: Online, pose: Poses, detections: Detections) -> Online:
 
 
 def _first(state: Online) -> Online:
-    """Try to distinguish the beads from all frames so far."""
+    """Attempt to distinguish the beads from all frames so far."""
     assert state.poses is not None
     if len(state.detections) < FIRST or sum(len(d) for d in state.detections) < 6:
         return state
@@ -182,7 +187,8 @@ def _renew(state: Online, start: Offsets) -> Online:
 
 
 def _prediction_sigma(state: Online, pose: Poses) -> float:
-    """Standard deviation of a predicted place [px], from the parameters' covariance."""
+    """Compute the standard deviation of a predicted place [px], from the parameters'
+    covariance."""
     assert state.fit is not None
     rows = _rows(state, pose)
     spread = np.einsum("ij,jk,ik->i", rows, state.fit.covariance, rows)
@@ -190,7 +196,8 @@ def _prediction_sigma(state: Online, pose: Poses) -> float:
 
 
 def _rows(state: Online, poses: Poses) -> FloatArray:
-    """d(pixels)/d(parameters, edge units) of all beads in some poses, (2 n k, p)."""
+    """Compute d(pixels)/d(parameters, edge units) of all beads in some poses, (2 n k,
+    p)."""
     assert state.fit is not None
     shape = state.detections[-1].shape
     n, k = len(poses), len(state.model)
@@ -218,17 +225,18 @@ class NextAngle:
 def next_angle(
     state: Online, pose: Poses, candidates: npt.ArrayLike, tolerance: Mapping[str, float]
 ) -> NextAngle:
-    """The candidate angle after which the worst sigma, in units of its tolerance, is smallest.
+    """Choose the angle after which the worst sigma, in units of its tolerance, is
+    smallest.
 
     Args:
-        state: what is known; needs an estimate.
+        state: with an estimate.
         pose: nominal pose (one); its angle is replaced by each candidate.
         candidates: (m,) nominal stage angles to choose from [rad].
         tolerance: wanted sigma of each parameter that matters, edge units.
 
     Raises:
         TwinError: there is no estimate yet, no candidate, or no tolerance.
-        UnknownNameError: a tolerance for what is not estimated.
+        UnknownNameError: a tolerance for a parameter that is not estimated.
     """
     require_estimated(state.free, tolerance)
     fit = state.fit
@@ -255,7 +263,8 @@ def next_angle(
 
 
 def _noise_px(fit: FitResult) -> float:
-    """Typical standard deviation of a used position [px], residuals and enlargement included."""
+    """Estimate the typical standard deviation of a used position [px], with residuals
+    and enlargement."""
     whiten = fit.problem.whiten[fit.certificate.used]
     stated = float(np.median(1.0 / np.sqrt(whiten[:, 0] * whiten[:, 2])))
     noise = fit.certificate.noise if math.isfinite(fit.certificate.noise) else 1.0

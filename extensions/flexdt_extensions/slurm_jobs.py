@@ -1,8 +1,9 @@
-"""Jobs of a SLURM queue that run dask workers: submitted, watched, submitted again, cancelled.
+"""Jobs of a SLURM queue that run dask workers: submitted, watched, submitted again,
+cancelled.
 
-A job that has left the queue, as one whose walltime is over, is submitted again while its workers
-are wanted. What sbatch, squeue and sacct say is passed on in their own words. Jobs that end again
-and again without one of their workers having come are an error.
+A job that has left the queue, as one whose walltime is over, is submitted again while the
+work goes on. Messages of sbatch, squeue and sacct are passed on unchanged. Jobs that end
+repeatedly before one of their workers has come are an error.
 """
 
 from __future__ import annotations
@@ -18,15 +19,16 @@ from typing import Final
 from flexdt.extending import CommandError
 
 REFUSED: Final = 4
-"""Exit code where there are no workers to be had."""
+"""Exit code where no workers can be had."""
 BARREN: Final = 3
-"""Jobs in a row that end before a worker of theirs has come, after which no more are submitted."""
+"""Number of jobs in a row that end before a worker of theirs has come, after which no
+more are submitted."""
 ANSWER_S: Final = 60.0
-"""How long one of SLURM's commands may take."""
+"""Time limit of one of SLURM's commands [s]."""
 SHOWN: Final = 4
-"""Jobs that a line names."""
+"""Largest number of jobs that a line names."""
 PLACEHOLDER: Final = "dummy-name"
-"""The name of the workers in a script that dask-jobqueue writes."""
+"""Name of the workers in a script that dask-jobqueue writes."""
 
 
 @dataclass
@@ -44,7 +46,7 @@ class Job:
     seen: bool = False
 
     def has(self, worker: str) -> bool:
-        """Whether a worker of that name is one of its own."""
+        """Check whether a worker of that name belongs to the job."""
         return worker == self.name or worker.startswith(f"{self.name}-")
 
 
@@ -62,7 +64,7 @@ class SlurmJobs:
         self._made = self._barren = 0
 
     def submit(self) -> None:
-        """Submit what is missing.
+        """Start the missing jobs with sbatch.
 
         Raises:
             CommandError: sbatch refuses, in its own words.
@@ -80,10 +82,13 @@ class SlurmJobs:
             self.jobs.append(Job(found[0], name))
 
     def tend(self, workers: Collection[str]) -> list[str]:
-        """Submit again what has left the queue; what there is to say.
+        """Replace jobs that have left the queue.
 
         Args:
             workers: names of those that are connected.
+
+        Returns:
+            Lines of progress: states of the queue, ended jobs and errors.
 
         Raises:
             CommandError: jobs end before a worker of theirs has come.
@@ -98,13 +103,14 @@ class SlurmJobs:
         return lines
 
     def close(self) -> None:
-        """Cancel all."""
+        """Remove all jobs from the queue."""
         if self.jobs:
             _run("scancel", *(job.id for job in self.jobs))
         self.jobs = []
 
     def _queue(self) -> tuple[dict[str, str] | None, list[str]]:
-        """Job -> its state and why, as squeue has them; None where it does not answer."""
+        """Read job -> its state and reason from squeue; None and its message where it
+        fails."""
         said = _run("squeue", "--noheader", "--me", "--format=%i %T (%r)")
         if said.returncode:
             return None, [f"squeue: {_words(said)}"]
@@ -112,6 +118,18 @@ class SlurmJobs:
         return {row[0]: row[-1] for row in rows}, []
 
     def _replace(self, gone: Sequence[Job], workers: Collection[str]) -> list[str]:
+        """Replace ended jobs by new ones, unless their workers are still connected.
+
+        Args:
+            gone: jobs that have left the queue.
+            workers: names of those that are connected.
+
+        Returns:
+            Lines about ended jobs, and an error of sbatch.
+
+        Raises:
+            CommandError: `BARREN` jobs in a row ended before a worker of theirs came.
+        """
         lines = []
         for job in gone:
             if any(map(job.has, workers)):
@@ -141,7 +159,8 @@ class SlurmJobs:
 
 
 def lifetime_s(walltime: str) -> int | None:
-    """When workers are to end by themselves, so that their tasks go on elsewhere in time [s].
+    """Compute when workers end by themselves, so that their tasks go on elsewhere in time
+    [s].
 
     Args:
         walltime: as SLURM reads it: minutes, MM:SS, HH:MM:SS, D-HH, D-HH:MM or D-HH:MM:SS.
@@ -168,7 +187,7 @@ def lifetime_s(walltime: str) -> int | None:
 
 
 def _outcome(job: str) -> str:
-    """How a job ended, as sacct has it."""
+    """Read from sacct how a job ended."""
     said = _run("sacct", "--noheader", "--parsable2", "--format=State,ExitCode", f"--jobs={job}")
     lines = said.stdout.split()
     return (
@@ -177,7 +196,7 @@ def _outcome(job: str) -> str:
 
 
 def _words(said: subprocess.CompletedProcess[str]) -> str:
-    """What a command said, in one line."""
+    """Format a command's output as one line."""
     text = said.stderr.strip() or said.stdout.strip() or f"exit code {said.returncode}"
     return " ".join(text.split())
 
@@ -196,4 +215,5 @@ def _run(*words: str) -> subprocess.CompletedProcess[str]:
 
 
 Tend = Callable[[Collection[str]], list[str]]
-"""What there is to do and to say about a cluster, from the names of its connected workers."""
+"""Acts on a cluster from the names of its connected workers, and returns lines of
+progress."""

@@ -1,11 +1,12 @@
-"""`flexdt job watch`: a client that calibrates while a job scans beads, and ends it in time.
+"""`flexdt job watch`: a client that calibrates while a job scans beads, and ends it in
+time.
 
-Each frame is fetched over the wire as soon as it is there and fed to the online calibration. Once
-that has an estimate, the server fits the data set as it is by then, as `flexdt calibrate` does, and
-only that fit ends the job. It looks twice, with the phantom's body subtracted, so its sigmas are
-smaller than the online ones, by a factor that is much the same a few frames later. It is asked
-again when the online sigmas times that factor meet what was asked, and not before an eighth more
-frames are there.
+Each frame is fetched over the wire as soon as it is complete and fed to the online
+calibration. Once that has an estimate, the server fits the present data set as `flexdt
+calibrate` does, and only that fit ends the job. It detects beads twice, with the
+phantom's body subtracted, so its sigmas are smaller than the online ones, by a factor
+that is much the same a few frames later. The next fit is requested when the online sigmas
+times that factor meet the tolerance, and not before an eighth more frames are complete.
 """
 
 from __future__ import annotations
@@ -36,13 +37,13 @@ POLL_S: Final = 0.2
 
 @dataclass(frozen=True)
 class Watched:
-    """How a watched job ended.
+    """Result of a watched job.
 
     Attributes:
         job: its last status.
-        frames: that were looked at.
-        sigmas: of the last fit that was asked for, edge units; None where it offers none.
-        reached: whether that fit met what was asked, and the job was ended for it.
+        frames: number of frames evaluated.
+        sigmas: of the last fit of the server, edge units; None where it offers none.
+        reached: whether that fit met the tolerance, and the job was ended for it.
     """
 
     job: JobStatus
@@ -61,20 +62,25 @@ def watch(
     priors: Mapping[str, float] | None = None,
     tell: Callable[[Online], object] = lambda state: None,
 ) -> Watched:
-    """End a job once a calibration from its frames is sure enough.
+    """End a job once a calibration from its frames is accurate enough.
 
     Args:
         client: of the twin that runs it; it need not be in control.
-        phantom: that is scanned; one that ships.
-        tolerance: parameter -> sigma that is enough, edge units.
-        job: which; the current one if left out.
+        phantom: the scanned one; one that ships.
+        tolerance: parameter -> sufficient sigma, edge units.
+        job: its name; the current one if left out.
         free: parameters to estimate.
-        priors: as of `flexdt calibrate`; None: the machine's, or the assumed ones of a machine that
+        priors: as of `flexdt calibrate`; None: the machine's, or the assumed ones of a
+            machine that
             does not ship.
         tell: called with the estimate after each frame.
 
+    Returns:
+        How the job ended, with the last sigmas.
+
     Raises:
-        TwinError: there is no such phantom, a tolerance is for what is not estimated, or for none.
+        TwinError: there is no such phantom, no tolerance, or one for a parameter not
+            estimated.
     """
     require_estimated(free, tolerance)
     model = bead_model(load_phantom(phantom))
@@ -101,9 +107,16 @@ def watch(
 
 
 def _frames(client: TwinClient, job: str) -> Iterator[tuple[str, Any, Any]]:
-    """Data set, line integrals and nominal cone_vec of each projection, until the job ends.
+    """Yield the projections of a job as they are complete, until it ends.
 
-    Of a scan of more than 2000 images, the wire tells as many that are spread evenly.
+    Of a scan of more than 2000 images, the wire has as many that are spread evenly.
+
+    Args:
+        client: of the twin.
+        job: its name.
+
+    Yields:
+        Data set, line integrals and nominal cone_vec.
     """
     seen = set[int]()
     while True:
