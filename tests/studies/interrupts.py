@@ -152,6 +152,8 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", nargs="*", default=list(COMMANDS), choices=list(COMMANDS))
     chosen = parser.parse_args()
+    # A shell ignores SIGINT for what it starts in the background, and so would our children.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     print(f"{'command':12}{'told':>6}{'done':>6}{'early':>6}{'wrong':>6}{'clock':>8}{'used':>8}")
     wrong = 0
     for name in chosen.only:
