@@ -28,7 +28,16 @@ LEAST_LIGHT: Final = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class LineIntegrals:
-    """Converts counts of one data set to line integrals."""
+    """Converts counts of one data set to line integrals.
+
+    Attributes:
+        dark: mean dark image, (rows, cols) [counts].
+        log_open: log of the open beam f - d, (rows, cols); 0 where dead.
+        dead: mask of dead pixels, and of those that are interpolated as they are.
+        before, after: flat indices of the live pixels between which each of these is
+            interpolated.
+        weight: of the latter.
+    """
 
     dark: Float32Array
     log_open: Float32Array

@@ -30,7 +30,16 @@ MATCH_PX: Final = 0.05
 
 @dataclass(frozen=True)
 class Rebuilt:
-    """Geometry computed from texts."""
+    """Geometry computed from texts.
+
+    Attributes:
+        poses: nominal, one for each image.
+        machine, profile: by which they were computed; None if the figures alone were
+            used.
+        positions: motor -> (n,) positions [mm, deg], script's sign; empty without a
+            machine.
+        notes: reasons for the choices, for people.
+    """
 
     poses: Poses
     machine: Machine | None

@@ -21,7 +21,15 @@ EDGE = 0.5
 
 @dataclass(frozen=True)
 class Figures:
-    """A geometry as stated in the settings texts."""
+    """A geometry as stated in the settings texts.
+
+    Attributes:
+        sod_mm, sdd_mm: source-object and source-detector distance along the beam.
+        hc_px, vc_px: piercing point (column, row) from the edge, binned pixels.
+        cor_px: column of the rotation axis at the height of the focal spot, from the
+            edge.
+        pixel_mm: binned pixel pitch.
+    """
 
     sod_mm: float
     sdd_mm: float

@@ -53,7 +53,15 @@ KINDS: Final[Mapping[str, str]] = {
 
 @dataclass(frozen=True)
 class Finding:
-    """A contradiction between two parts of the input."""
+    """A contradiction between two parts of the input.
+
+    Attributes:
+        kind: one of `KINDS`.
+        cause: what was found, with its figure and unit.
+        remedy: what the user can do.
+        severity: reaction of an entry point.
+        figure: the figure by which it was found, in the unit given in `cause`.
+    """
 
     kind: str
     cause: str

@@ -194,10 +194,8 @@ def usable(voxel_bytes: int, images: Float32Array, threads: int, before: int = 0
         images: (n, rows, cols).
         threads: number of threads of the processor.
         before: number of views of the same voxels that the processor has projected. More
-            are then
-            likely: the volume is moved once these would have paid for it, so that it
-            takes at most
-            twice the least time.
+            are then likely: the volume is moved once these would have paid for it, so
+            that it takes at most twice the least time.
     """
     views = len(images) + (before if voxel_bytes >= WORTH_BYTES else 0)
     if not availability().present or (voxel_bytes and views < VIEWS_A_THREAD * threads):
@@ -440,7 +438,8 @@ def launcher(
 ) -> Callable[[], None]:
     """Prepare the kernels for these views; return a function that launches them.
 
-    images: flat, on the device. One array goes there: views by kernel, each with the number of its
+    images: flat, on the device. One array goes there: views by kernel, each with the
+        number of its
     image. Views of a detector on its side take its columns for rows, so that lanes are neighbours
     along z there, too.
     """

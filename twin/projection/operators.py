@@ -110,8 +110,7 @@ def level_axes(
 
     Args:
         rays: (n, 12) source relative to the volume's centre, first pixel minus source, u,
-            v in
-            voxel units.
+            v in voxel units.
         counts: (nz, ny, nx) voxels.
         shape: detector (rows, cols).
     """
@@ -161,8 +160,7 @@ def forward(
 
     Args:
         volume: attenuation [1/mm], as Volume(data, voxel_mm). Of a `DeviceVolume`, the
-            images stay
-            on the device.
+            images stay on the device.
         cone_vec: ConeVec or (n, 12) [mm], object frame; any orientation of the detector.
         shape: detector (rows, cols); default: the geometry's own.
         out: float32 (n, rows, cols), C order, filled and returned if given.
@@ -171,8 +169,8 @@ def forward(
         float32 (n, rows, cols), dimensionless; numpy's, or on the device numba's array.
 
     Raises:
-        GeometryError: volume, cone_vec, shape or out do not fit, or a row gives
-            its pixels no rays of their own.
+        GeometryError: volume, cone_vec, shape or out do not fit, or a row gives its
+            pixels no rays of their own.
 
     Examples:
         A ray along y through 4 voxels of 0.5 mm and 0.02 / mm:
@@ -243,11 +241,10 @@ def back(
         cone_vec: ConeVec or (n, 12) [mm], one row a projection.
         like: the grid, or a volume on it, whose values are not used.
         out: an array of `room_like(like)`, overwritten and taken for the result if given:
-            new
-            memory costs as much as half the work of one view.
+            new memory costs as much as half the work of one view.
         deterministic: on a CUDA device, where rays add to voxels as they come, sums whose
-            bytes are
-            equal at every run, for three times the memory; the processor's always are.
+            bytes are equal at every run, for three times the memory; the processor's
+            always are.
 
     Returns:
         Volume (of images on a device: `DeviceVolume`) on the grid of `like`; values in
@@ -256,8 +253,7 @@ def back(
 
     Raises:
         GeometryError: the number of projections is not that of the views, out does not
-            fit, or a
-            row gives its pixels no rays of their own.
+            fit, or a row gives its pixels no rays of their own.
 
     Examples:
         >>> volume = Volume(np.full((3, 4, 3), 0.02, np.float32), 0.5)

@@ -30,39 +30,41 @@ from flexdt.twin.reconstruction.consistency.agreement import Contradiction, cont
 from flexdt.twin.reconstruction.volume_errors import interpolated
 
 SAFETY: Final = 3.0
-"""The coarse volume has the flaws, too, and is smooth: of what they take away it shows a third."""
+"""Factor of the bound: the smooth coarse volume shows a third of what flaws take away."""
 TRUSTED: Final = 0.15
-"""Part of what a prism adds beyond the edges that may be wrong where it explains what was seen."""
+"""Share of a prism's part beyond the edges that may be wrong if it explains the
+images."""
 FLOOR: Final = 0.003
-"""What FDK without a flaw is off by, of the attenuation about a voxel."""
+"""Error of FDK without flaws, relative to the attenuation about a voxel."""
 USUAL_SHARE: Final = {
     "angles": 0.3, "aside": 0.1, "cone": 0.7, "rows": 1.0, "beyond": 1.0, "drift": 1.3,
 }  # fmt: skip
-"""Part of a cause's bound that half of a scan's uniform regions stay below: causes that come to
-their bound in narrow places count little (`tests/studies/accuracy_rank.py`, seeds 61 and 62)."""
+"""Cause -> share of its bound that half of a scan's uniform regions stay below. Causes
+that reach their bound in narrow places have small ones
+(`tests/studies/accuracy_rank.py`, seeds 61 and 62)."""
 USUAL_FLOOR: Final = 0.001
-"""The same of FDK without a flaw, of the attenuation."""
+"""Usual error of FDK without flaws, relative to the attenuation."""
 SMOOTH: Final = 1.5
-"""Standard deviation of what the coarse volume is smoothed with [nodes]: steps between its voxels
-would show as flaws of their own."""
+"""Standard deviation of the smoothing of the coarse volume [nodes]: steps between its
+voxels would show as flaws of their own."""
 STEEP: Final = 0.05
-"""Change between nodes, over the object's attenuation, at an edge, where blur hides what a flaw
-does."""
+"""Change between nodes at an edge, relative to the object's attenuation; blur hides
+flaws there."""
 MAX_VOXEL_NODES: Final = 4.0
-"""Edge of a voxel over that of a node, above which a grid cannot hold what the bound is of."""
+"""Largest edge of a voxel for which a grid can hold uniform regions [nodes]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Bias:
-    """What may be off in a volume, on a coarse grid.
+    """Possible errors of a volume, on a coarse grid.
 
     Attributes:
         found: attenuation, smooth [1/mm].
-        even: weights of its nodes, little where values change fast and where some views do not see
-            them, (nz, ny, nx).
+        even: weights of its nodes, little where values change fast and where some views
+            do not see them, (nz, ny, nx).
         inside: nodes of the object, (nz, ny, nx).
-        causes: angles, aside, cone, rows, beyond or drift -> what it changes at most [1/mm], (nz,
-            ny, nx).
+        causes: angles, aside, cone, rows, beyond or drift -> what it changes at most
+            [1/mm], (nz, ny, nx).
         contradiction: between images and geometry, with which nothing is bounded.
     """
 
@@ -79,8 +81,10 @@ class Bias:
         return np.asarray(FLOOR * np.abs(self.found.data) + flaws, np.float32)
 
     def bound(self, grid: Volume) -> Float32Array | None:
-        """Bound at each voxel of a grid, NaN where it has no value, (nz, ny, nx) [1/mm]; None where
-        images and geometry do not belong together.
+        """Compute the bound at each voxel of a grid, (nz, ny, nx) [1/mm].
+
+        NaN where the grid has no value; None if images and geometry do not belong
+        together.
         """
         if self.contradiction is not None:
             return None
@@ -90,8 +94,10 @@ class Bias:
         return out
 
     def accuracy(self, grid: Grid | Volume) -> Accuracy | None:
-        """Of the object's uniform regions in a grid; None where it holds none, and where images
-        and geometry do not belong together.
+        """Compute the accuracy of the object's uniform regions in a grid.
+
+        None if the grid holds no such region, or if images and geometry do not belong
+        together.
         """
         if self.contradiction is not None or self.too_coarse(grid):
             return None
@@ -114,7 +120,7 @@ class Bias:
         return Accuracy(half, most, worst, "beyond" in off)
 
     def too_coarse(self, grid: Grid | Volume) -> bool:
-        """Whether a grid's voxels are too large to hold a uniform region."""
+        """Return whether a grid's voxels are too large to hold a uniform region."""
         edge = np.max(grid.voxel_mm)
         return bool(edge > MAX_VOXEL_NODES * max(self.found.voxel_xyz))
 
@@ -146,6 +152,7 @@ def bias_of(
 
 
 def _bias_of(scan: CoarseScan) -> Bias:
+    """Reconstruct a coarse scan and bound its errors, cause by cause."""
     from scipy.ndimage import gaussian_filter
 
     data = scan.fdk(scan.images, scan.cone_vec, scan.truncation)
@@ -188,14 +195,20 @@ def _bias_of(scan: CoarseScan) -> Bias:
 
 
 def _drift(images: Float32Array) -> Float32Array:
-    """What images (n, rows, cols) show beside the object, in every pixel."""
+    """Copy the smaller value at a row's two ends, beside the object, to every pixel.
+
+    Args:
+        images: (n, rows, cols); each view's ends are averaged over rows.
+    """
     ends = images[:, :, [0, -1]].mean(axis=1)
     beside = np.take_along_axis(ends, np.abs(ends).argmin(axis=1)[:, None], axis=1)
     return np.ascontiguousarray(np.broadcast_to(beside[:, :, None], images.shape))
 
 
 def _typical(values: Float32Array) -> float:
-    """Attenuation below which half of all that attenuates lies: of a body, not of a pin in it."""
+    """Compute the attenuation below which half of the attenuation is: of a body, not of a
+    pin in it.
+    """
     ordered = np.sort(values[values > 0.0], axis=None)
     if not ordered.size:
         return 0.0
@@ -204,7 +217,7 @@ def _typical(values: Float32Array) -> float:
 
 
 def _evenness(values: Float32Array, most: float) -> FloatArray:
-    """Weights of nodes, little where values change by more than `most`."""
+    """Compute weights of nodes, small where values change by more than `most`."""
     from scipy.ndimage import gaussian_gradient_magnitude
 
     steep = gaussian_gradient_magnitude(values.astype(np.float64), 0.5, mode="nearest")
@@ -212,7 +225,7 @@ def _evenness(values: Float32Array, most: float) -> FloatArray:
 
 
 def _about(values: Float32Array, weights: FloatArray) -> FloatArray:
-    """Root of the mean square about each node: what differs has places where it is zero."""
+    """Compute the root mean square about each node; differences have zeros in places."""
     from scipy.ndimage import gaussian_filter
 
     def mean(what: FloatArray) -> FloatArray:

@@ -118,15 +118,18 @@ def checked_fdk(
     *,
     errors: bool = True,
 ) -> tuple[Volume, list[str]]:
-    """A volume of FDK, and what a user has to be warned of.
+    """Reconstruct a volume by FDK and list warnings for the user.
 
-    Args and raises as `fdk`, but for these:
+    Args and raises as `fdk`, except for these:
 
     Args:
         image: gives an image by its number, (rows, cols).
         parts: see `fdk_parts`.
         cone_vec: of all views.
         shape: (rows, cols).
+
+    Returns:
+        the volume and the texts of warnings.
     """
     truncation = truncation_of(image, cone_vec, shape)
     volume = fdk_parts(parts, cone_vec, shape, like, window, progress, truncation, errors=errors)
@@ -139,8 +142,7 @@ def checked_fdk(
 
 
 def bias_warnings(bias: Bias | None, grid: Grid | Volume) -> list[str]:
-    """What a user has to be warned of: uniform regions that may be off, or of which nothing is
-    known.
+    """List warnings about uniform regions that may deviate, or of which nothing is known.
 
     Args:
         bias: of the scan.

@@ -34,22 +34,24 @@ from flexdt.twin.reconstruction.feldkamp.backprojection import OnProcessor
 from flexdt.twin.reconstruction.feldkamp.fdk import fdk_parts
 
 NODES: Final = 40
-"""Columns, rows and voxels along the longest side, at most: what is off changes smoothly."""
+"""Largest number of columns, rows and voxels along the longest side: bias changes
+smoothly."""
 FEWEST: Final = 4.0
-"""Columns on either side of the axis, where the panel has so many: a narrow overlap stays one."""
+"""Least columns on either side of the axis, if the panel has so many: a narrow overlap
+stays one."""
 VIEWS: Final = 180
-"""Views, at most: enough for so many nodes and a panel moved aside."""
+"""Largest number of views: enough for the nodes and a panel moved aside."""
 COMPARED_VIEWS: Final = 2.0
-"""Views for a column, about, of a scan whose images are compared with its volume."""
+"""Views per column, about, of a scan whose images are compared with its volume."""
 COMPARED_ROWS: Final = 16
-"""Rows of the same, at least, where the panel has so many."""
+"""Least rows of that scan, if the panel has so many."""
 AWAY: Final = 50.0
-"""Distance of a source whose rays are parallel, over the radius of the scan."""
+"""Distance of the source for parallel rays, in radii of the scan."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rung:
-    """A scan of the ladder.
+    """One scan of the ladder.
 
     Attributes:
         flaw: what it has and the one before does not.
@@ -92,7 +94,7 @@ class CoarseScan:
         shape: tuple[int, int],
         truncation: Truncation | None,
     ) -> CoarseScan:
-        """Of a scan; arguments as for `bias.bias_of`."""
+        """Reduce a scan to few views and pixels; arguments as for `bias.bias_of`."""
         circle = circle_of(cone_vec)
         flip = on_its_side(cone_vec)
         if flip:
@@ -161,7 +163,7 @@ class CoarseScan:
 
     @cached_property
     def grid(self) -> Volume:
-        """The field of view, in layers as high as rows; without values."""
+        """Grid of the field of view without values, in layers as high as rows."""
         x, y = self.circle.centre.tolist()
         scan, away = self.cone_vec, np.array([x, y, 0.0])
         scan = ConeVec.from_vectors(scan.source - away, scan.detector - away, scan.u, scan.v)
@@ -179,7 +181,7 @@ class CoarseScan:
 
     @cached_property
     def rim(self) -> npt.NDArray[np.bool_]:
-        """Where some views do not see the grid, (ny, nx)."""
+        """Voxel columns outside some views, (ny, nx) bool."""
         x, y, _ = self.grid.centers()
         away = np.hypot(x - self.circle.centre[0], (y - self.circle.centre[1])[:, None])
         # A voxel and a half. Nodes lie at just that distance; rounding shall not decide on them.
@@ -187,7 +189,7 @@ class CoarseScan:
 
     @cached_property
     def more(self) -> int:
-        """Layers by which the object goes on above and below the grid, as far as views see."""
+        """Layers of the object above and below the grid, as far as views see."""
         count = self.images.shape[1]
         ends = float(np.abs(self.images[:, [0, -1]]).mean())
         if count == 1 or ends <= ACCURACY * float(np.abs(self.images).mean()):
@@ -197,7 +199,7 @@ class CoarseScan:
 
     @cached_property
     def sparse(self) -> bool:
-        """Whether the views of a circle leave directions out, or are too few for these columns."""
+        """True if a circle's views leave directions out, or are too few for the columns."""
         step = self.circle.step
         apart = float(np.ptp(step)) > float(np.median(step))
         few = len(self.angles) < 0.5 * np.pi * self.images.shape[2]
@@ -206,7 +208,7 @@ class CoarseScan:
     def fdk(
         self, images: Float32Array, cone_vec: ConeVec, truncation: Truncation | None = None
     ) -> Float32Array:
-        """The grid's values from some images, NaN where no data cover it."""
+        """Reconstruct the grid from some images, NaN where no data cover it."""
         shape = (images.shape[1], images.shape[2])
         volume = fdk_parts(
             lambda: [images.copy()], cone_vec, shape, self.grid, truncation=truncation,
@@ -215,7 +217,7 @@ class CoarseScan:
         return volume.data
 
     def seen(self, thing: Float32Array, rung: Rung) -> Float32Array:
-        """Values on the grid, (nz, ny, nx), projected and reconstructed."""
+        """Project values on the grid, (nz, ny, nx), and reconstruct them."""
         truncation = self.truncation
         if truncation is not None:
             truncation = truncation.nothing if rung.flaw and truncation.beyond else None
@@ -244,12 +246,12 @@ class CoarseScan:
     def parallel(
         self, flaw: str, ends: tuple[float, float], turn: FloatArray | None = None
     ) -> Rung:
-        """Parallel views of a panel that sees some distances from the axis on its two sides [mm].
+        """Make parallel views of a panel that sees given distances from the axis.
 
         Args:
             flaw: of the rung.
-            ends: these distances.
-            turn: (n,) angles; None for everywhere [rad].
+            ends: distances on the panel's two sides [mm].
+            turn: (n,) angles [rad]; None for even ones around the circle.
         """
         if turn is None:
             turn = np.linspace(0.0, 2.0 * np.pi, VIEWS, endpoint=False)
@@ -267,8 +269,9 @@ class CoarseScan:
         return Rung(flaw, views, (self.grid.shape[0] + 2 * self.more, cols))
 
     def ladder(self) -> list[Rung]:
-        """From parallel rays of a panel in the middle to the scan; flaws that it does not have are
-        no rungs.
+        """List scans from parallel rays of a centred panel to the real scan.
+
+        Flaws that the scan does not have are left out.
         """
         rows, cols = self.images.shape[1:]
         low, high = self.ends

@@ -35,7 +35,7 @@ from flexdt.twin.signatures import public
 
 
 def far_apart(count: int) -> list[int]:
-    """0 .. count-1 ordered so that neighbours in time are far apart (golden-section steps)."""
+    """Order 0 .. count-1 so that neighbours in time are far apart (golden-section steps)."""
     return [int(i) for i in np.argsort((np.arange(count) * 0.6180339887498949) % 1.0)]
 
 
@@ -54,22 +54,24 @@ def sirt(
     watch: Watch | None = None,
     progress: Progress = None,
 ) -> Volume:
-    """Simultaneous iterative reconstruction: x += C A' R (b - A x), R and C inverse row and
-    column sums. The residual weighted with R never grows.
+    """Reconstruct by SIRT: x += C A' R (b - A x), R and C inverse row and column sums.
 
-    With `variances`, weighted least squares: R holds one over them, C one over the curvature. It
-    ends with the first iteration that finds no more than noise left: squares over variances that
-    are 1 in the mean.
+    The residual weighted with R never grows.
 
-    With `hardening`, A x is what the spectrum would have measured through the materials of x, which
-    are told apart by value in every iteration anew. The residual is then scaled by line integrals
-    at one energy over those of the spectrum. (Their difference added to b would have the same
-    solution, but diverges where thin steel attenuates more than twice as much as at that energy.)
-    The volume has the attenuation at this energy.
+    With `variances`, weighted least squares: R holds one over them, C one over the
+    curvature. It ends with the first iteration in which only noise is left: squares over
+    variances that are 1 in the mean.
 
-    With `surroundings`, coarse voxels about the grid are found along with it, so that what lies
-    beyond it is not pressed into it. They fill the space out to `surroundings`, in voxels
-    of about its size, of which a whole number fills the grid along each axis (so none is larger).
+    With `hardening`, A x is the spectrum's measurement through the materials of x, which
+    are separated by value in every iteration. The residual is then scaled by line
+    integrals at one energy over those of the spectrum. (Their difference added to b would
+    have the same solution, but diverges where thin steel attenuates more than twice as
+    much as at that energy.) The volume has the attenuation at this energy.
+
+    With `surroundings`, coarse voxels about the grid are reconstructed along with it, so
+    that matter beyond it is not pressed into it. They fill the space out to
+    `surroundings`, in voxels of about its size, an integer number of which fills the grid
+    along each axis (so none is larger).
 
     Args:
         projections: (n, rows, cols) line integrals.
@@ -78,18 +80,21 @@ def sirt(
         iterations: how many; with `variances` at most.
         start: first guess on the same grid; zero by default.
         nonnegative: clip at zero after each iteration.
-        variances: (n, rows, cols) of the line integrals; of N photons counted, about 1 / N.
-        hardening: spectrum and materials of the object, `Polychromatic.of`; line integrals are then
-            those measured, uncorrected.
+        variances: (n, rows, cols) of the line integrals; of N photons counted, about 1 /
+            N.
+        hardening: spectrum and materials of the object, `Polychromatic.of`; line
+            integrals are then those measured, uncorrected.
         surroundings: grid of the whole object, coarser than `like`, which lies in it.
         watch: called in every iteration.
-        progress: a bar after two seconds; False for none, or what takes the fraction done.
+        progress: a bar after two seconds; False for none, or what takes the fraction
+            done.
 
     Returns:
         Volume [1/mm] on the grid of `like`.
 
     Raises:
-        GeometryError: shapes that do not fit, or surroundings that do not reach beyond the grid.
+        GeometryError: shapes that do not fit, or surroundings that do not reach beyond
+            the grid.
         LimitError: no iterations.
 
     Examples:
@@ -129,7 +134,8 @@ def sart(
     watch: Watch | None = None,
     progress: Progress = None,
 ) -> Volume:
-    """SIRT's step on one subset of views after another: faster at first, noisier in the end.
+    """Reconstruct by SIRT's step on subsets of views in turn: faster at first, noisier in
+    the end.
 
     Args:
         projections, cone_vec, like, start, nonnegative, variances: as for `sirt`.
@@ -173,7 +179,7 @@ def _subset_steps(
     watch: Watch | None,
     advance: Advance,
 ) -> Volume:
-    """SIRT's step on the views of one part after another, for each iteration."""
+    """Take SIRT's step on the views of each part in turn, for each iteration."""
     sums = [problem.scales(part) for part in parts]
     weighted = problem.weights is not None
     x = problem.first(start)
@@ -207,7 +213,8 @@ def cgls(
     watch: Watch | None = None,
     progress: Progress = None,
 ) -> Volume:
-    """Conjugate gradients for least squares: the residual falls at every iteration.
+    """Reconstruct by conjugate gradients for least squares: the residual falls every
+    iteration.
 
     Args: as for `sirt`.
 
@@ -267,7 +274,7 @@ def em(
     watch: Watch | None = None,
     progress: Progress = None,
 ) -> Volume:
-    """Expectation maximisation: x *= A'(b / A x) / A' 1, positive by construction.
+    """Reconstruct by expectation maximisation: x *= A'(b / A x) / A' 1, always positive.
 
     Negative line integrals (noise) count as zero.
 
@@ -293,7 +300,7 @@ def _em(
     watch: Watch | None,
     advance: Advance,
 ) -> Volume:
-    """Multiply by the ratios of measured and projected line integrals, spread back."""
+    """Multiply by the back-projected ratios of measured and projected line integrals."""
     measured = np.maximum(problem.measured, np.float32(0))
     whole = problem.spread(ones(measured)).copy(order="K")
     x = problem.first(start)

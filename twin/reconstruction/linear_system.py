@@ -35,22 +35,22 @@ from flexdt.twin.projection.volume import DeviceVolume
 from flexdt.twin.reconstruction.scatter_correction import Polychromatic
 
 SMALLEST = 1e-6
-"""Sums of weights below this part of the largest are not divided by."""
+"""Least sum of weights that is divided by, as a share of the largest."""
 MOST_FINER = 100
-"""Times as many voxels about a region as were asked for, at most: none is larger than it."""
+"""Largest number of voxels about a region, in multiples of the requested number."""
 STACKS, VOLUMES = 4, 5
-"""How many stacks of images, and volumes, a method holds at a time, at most."""
+"""Largest number of stacks of images, and of volumes, that a method holds at a time."""
 
 
 Found = TypeVar("Found")
 Some = slice | npt.NDArray[np.intp]
-"""Which views."""
+"""Indices of views."""
 ALL = slice(None)
 
 
 @dataclass(frozen=True)
 class Step:
-    """What happened in one iteration.
+    """Report of one iteration.
 
     Attributes:
         iteration: from 1.
@@ -96,11 +96,11 @@ class LinearSystem:
         hardening: Polychromatic | None = None,
         surroundings: Volume | Grid | None = None,
     ) -> LinearSystem:
-        """From checked arguments.
+        """Check the arguments and make the system from them.
 
         Raises:
-            GeometryError: no views, shapes that do not fit, variances that are not above 0,
-                surroundings within the region, or either with images on a device.
+            GeometryError: no views, shapes that do not fit, variances that are not above
+                0, surroundings within the region, or either with images on a device.
             LimitError: no iterations.
         """
         if iterations < 1:
@@ -137,7 +137,7 @@ class LinearSystem:
         return self.measured.shape[1], self.measured.shape[2]
 
     def first(self, start: Volume | None) -> Float32Array:
-        """Values to begin with: a copy of the first guess, or zeros."""
+        """Return start values: a copy of the first guess, or zeros."""
         if start is None:
             return np.zeros(self.like.shape, np.float32)
         if start.shape != self.like.shape or not np.allclose(
@@ -152,7 +152,7 @@ class LinearSystem:
         return forward(replace(self.like, data=x), self.geometry[views], self.shape)
 
     def spread(self, y: Float32Array, views: Some = ALL) -> Float32Array:
-        """The adjoint, in memory that the next call overwrites."""
+        """Apply the adjoint, into memory that the next call overwrites."""
         return back(y, self.geometry[views], self.like, self.room).data
 
     def misfit(self, x: Any, views: Some) -> tuple[Any, Any]:
@@ -175,11 +175,12 @@ class LinearSystem:
         return room_like(self.like)
 
     def scales(self, views: Some) -> tuple[Float32Array, Float32Array]:
-        """Factors of the residuals of some views, and of what they add to the voxels.
+        """Compute factors of the residuals of some views, and of their back-projection.
 
-        Without weights inverse sums of the projector's rows and columns. With weights those, and
-        one over the curvature of a paraboloid above the weighted squares, which no step overshoots
-        (Erdogan and Fessler 1999). Zero where (nearly) nothing is.
+        Without weights they are inverse sums of the projector's rows and columns. With
+        weights those, and one over the curvature of a paraboloid above the weighted
+        squares, which no step overshoots (Erdogan and Fessler 1999). Zero where the sum
+        is (nearly) zero.
         """
         rows = self.project(ones(self.first(None)), views)
         if self.weights is None:
@@ -188,7 +189,7 @@ class LinearSystem:
         return weights, inverse(self.spread(weights * rows, views))
 
     def volume(self, x: Float32Array) -> Volume:
-        """The voxels that were found, on their grid."""
+        """Return the reconstructed voxels on their grid."""
         return replace(self.like, data=x)
 
     def tell(self, watch: Watch | None, i: int, of: int, rest: Float32Array) -> None:
@@ -199,7 +200,7 @@ class LinearSystem:
 
 @dataclass(frozen=True, eq=False)
 class DeviceProblem(LinearSystem):
-    """The same on a CUDA device: every array is a `DeviceArray`.
+    """A `LinearSystem` on a CUDA device: every array is a `DeviceArray`.
 
     Attributes:
         returns: whether the volume goes back to the host, where the images came from.
@@ -209,7 +210,7 @@ class DeviceProblem(LinearSystem):
 
     @classmethod
     def of_host(cls, problem: LinearSystem) -> DeviceProblem:
-        """With the line integrals moved there, unless they are there."""
+        """Copy a system to the device; line integrals that are there stay."""
         there: Any = DeviceArray.of_images(problem.measured)
         weights: Any = problem.weights
         if weights is not None:
@@ -218,22 +219,22 @@ class DeviceProblem(LinearSystem):
         return cls(there, problem.geometry, problem.like, weights, returns=home)
 
     def first(self, start: Volume | None) -> Any:
-        """See `LinearSystem`."""
+        """Return start values; see `LinearSystem`."""
         if start is None:
             return DeviceArray.of_volume(DeviceVolume.blank(self.like))
         return DeviceArray.of_voxels(replace(self.like, data=super().first(start)))
 
     def project(self, x: Any, views: Some = ALL) -> Any:
-        """See `LinearSystem`."""
+        """Project voxels; see `LinearSystem`."""
         return DeviceArray.of_images(forward(x.volume, self.geometry[views], self.shape))
 
     def spread(self, y: Any, views: Some = ALL) -> Any:
-        """See `LinearSystem`; in memory of its own."""
+        """Apply the adjoint, into new memory; see `LinearSystem`."""
         found: Any = back(y.images, self.geometry[views], self.like)
         return DeviceArray.of_volume(found)
 
     def volume(self, x: Any) -> Any:
-        """See `LinearSystem`; a `DeviceVolume` where the images were on the device."""
+        """Return the voxels, as a `DeviceVolume` if the images were on the device."""
         return x.volume.to("cpu") if self.returns else x.volume
 
 
@@ -254,11 +255,13 @@ class RegionSystem(LinearSystem):
 
     @classmethod
     def within(cls, inner: LinearSystem, about: Volume | Grid) -> RegionSystem:
-        """The system of a region, with surroundings out to `about` of voxels about as large as its.
+        """Make the system of a region with surroundings out to `about`.
+
+        The surroundings' voxels are about as large as those of `about`.
 
         Raises:
-            GeometryError: `about` does not reach beyond the region, or that is too thin for voxels
-                of nearly that size.
+            GeometryError: `about` does not reach beyond the region, or that is too thin
+                for voxels of nearly that size.
         """
         wanted, (low, high) = as_volume(about), inner.like.boxes[0]
         parts = np.maximum(np.round((high - low) / wanted.voxel_xyz), 1.0)
@@ -285,7 +288,9 @@ class RegionSystem(LinearSystem):
         return cls(**given, outer=Volume(zeros, (dx, dy, dz), (x, y, z)), outside=outside)
 
     def grids(self, x: Float32Array) -> tuple[Float32Array, Float32Array]:
-        """The region's voxels and the surroundings', (z, y, x) with z contiguous, in x's memory."""
+        """Split x into the voxels of region and surroundings, (z, y, x), z contiguous, no
+        copy.
+        """
         (nz, ny, nx), (mz, my, mx) = self.like.shape, self.outer.shape
         fine, coarse = np.split(x, [nz * ny * nx])
         return (
@@ -294,14 +299,14 @@ class RegionSystem(LinearSystem):
         )
 
     def first(self, start: Volume | None) -> Float32Array:
-        """See `LinearSystem`; the surroundings begin with zeros."""
+        """Return start values; the surroundings begin with zeros."""
         x = np.zeros(math.prod(self.like.shape) + self.outside.size, np.float32)
         if start is not None:
             self.grids(x)[0][...] = super().first(start)
         return x
 
     def project(self, x: Float32Array, views: Some = ALL) -> Float32Array:
-        """See `LinearSystem`."""
+        """Project region and surroundings; see `LinearSystem`."""
         fine, coarse = self.grids(x)
         geometry = self.geometry[views]
         images = forward(replace(self.like, data=fine), geometry, self.shape)
@@ -310,7 +315,7 @@ class RegionSystem(LinearSystem):
         return images
 
     def spread(self, y: Float32Array, views: Some = ALL) -> Float32Array:
-        """See `LinearSystem`."""
+        """Apply the adjoint of both; see `LinearSystem`."""
         fine, coarse = self.grids(self.room)
         geometry = self.geometry[views]
         back(y, geometry, self.like, fine)
@@ -324,12 +329,13 @@ class RegionSystem(LinearSystem):
         return self.first(None)
 
     def volume(self, x: Float32Array) -> Volume:
-        """The region's voxels."""
+        """Return the region's voxels."""
         return replace(self.like, data=self.grids(x)[0])
 
 
 def solved(problem: LinearSystem, method: Callable[[LinearSystem], Found]) -> Found:
-    """By a method on the device, if images are there or it has room, or else on the processor.
+    """Run a method on the device, if images are there or it has room, else on the
+    processor.
 
     With hardening or surroundings only projections are made on a device.
     """
@@ -346,19 +352,19 @@ def solved(problem: LinearSystem, method: Callable[[LinearSystem], Found]) -> Fo
 
 
 def ones(like: Any) -> Any:
-    """Ones of the form of an array, which may be on a device."""
+    """Create ones of the shape of an array, which may be on a device."""
     return like * np.float32(0) + np.float32(1)
 
 
 def inverse(values: Float32Array) -> Float32Array:
-    """One over sums of weights, zero where (nearly) nothing is."""
+    """Compute one over sums of weights, zero where the sum is (nearly) zero."""
     found: Float32Array = ratio(ones(values), values)
     return found
 
 
 @singledispatch
 def ratio(a: Any, b: Any) -> Any:
-    """a / b, zero where (nearly) nothing is in b."""
+    """Compute a / b, zero where b is (nearly) zero."""
     return np.divide(a, b, out=np.zeros_like(b), where=b > SMALLEST * float(b.max()))
 
 

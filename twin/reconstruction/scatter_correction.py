@@ -41,13 +41,13 @@ DEPTHS = 400
 THIN: Final = 1e-3
 """Line integral below which a spectrum attenuates as its mean does."""
 THICKEST_MM, FINE = 1e4, 2e-4
-"""Paths through a material that effective energies hold for (they stop where nothing gets through),
-and the relative error of the signal that they may have."""
+"""Largest path through a material for effective energies [mm] (tables end where
+nothing gets through), and the largest relative error of the signal."""
 
 
 @dataclass(frozen=True, eq=False)
 class Hardening:
-    """Measured (polychromatic) line integral to what one energy would have measured.
+    """Conversion of measured (polychromatic) line integrals to those at one energy.
 
     Attributes:
         measured: growing line integrals.
@@ -80,7 +80,8 @@ def hardening(
     panel: Detector | None = None,
     tube: TubeModel | None = None,
 ) -> Hardening:
-    """The correction for an object of one material, from tube and detector as modelled.
+    """Compute the correction for an object of one material, by the models of tube and
+    detector.
 
     Args:
         material: what the object is made of.
@@ -108,14 +109,15 @@ def hardening(
 @public
 @dataclass(frozen=True, eq=False)
 class Polychromatic:
-    """What a spectrum measures behind several materials, for `sirt` and `sart`.
+    """Measurement of a spectrum behind several materials, for `sirt` and `sart`.
 
-    A voxel is of one material, as dense as its value says (Joseph and Spital, J. Comput. Assist.
-    Tomogr. 2 (1978) 100); the border between two is the geometric mean of their attenuation at one
-    energy. Paths through the materials so give the line integrals that the volume has at this
-    energy, and what the spectrum would have measured. Mixtures in proportion instead would take
-    noise of plastic for traces of metal, which harden the beam, on average too much; a border
-    halfway would take metal, which looks thin before it is corrected, for dense plastic for good.
+    A voxel is of one material, as dense as its value says (Joseph and Spital, J. Comput.
+    Assist. Tomogr. 2 (1978) 100); the border between two is the geometric mean of their
+    attenuation at one energy. Paths through the materials so give the line integrals that
+    the volume has at this energy, and what the spectrum would have measured. Mixtures in
+    proportion instead would take noise of plastic for traces of metal, which harden the
+    beam, on average too much; a border halfway would take metal, which looks thin before
+    it is corrected, for dense plastic for good.
 
     Attributes:
         mu: (m,) attenuation of each material at `energy_keV` [1/mm].
@@ -143,11 +145,11 @@ class Polychromatic:
         panel: Detector | None = None,
         tube: TubeModel | None = None,
     ) -> Polychromatic:
-        """From tube and detector as modelled; arguments as for `hardening`, of several materials.
+        """Compute the model from tube and detector; arguments as for `hardening`.
 
         Raises:
-            LimitError: no material, two that attenuate alike, no spectrum for `kV`, or an energy
-                that the tables do not have.
+            LimitError: no material, two that attenuate alike, no spectrum for `kV`, or an
+                energy that the tables do not have.
         """
         ends = tables().energy_keV[[0, -1]]
         require_within("energy_keV", energy_keV, float(ends[0]), float(ends[1]), "keV")
@@ -159,8 +161,9 @@ class Polychromatic:
         return cls(mu, beam, energy_keV)
 
     def amounts(self, values: Float32Array) -> Iterator[Float32Array]:
-        """Of each material the density in voxels (...) of these values [1/mm], relative to the one
-        that was named.
+        """Yield each material's density in voxels (...) of these values [1/mm].
+
+        Densities are relative to the named material's.
         """
         order = np.argsort(self.mu)
         of = order[np.searchsorted(np.sqrt(self.mu[order][1:] * self.mu[order][:-1]), values)]
@@ -168,11 +171,11 @@ class Polychromatic:
             yield np.where(of == m, values / mu, np.float32(0))
 
     def line_integrals(self, paths_mm: Float32Array) -> tuple[Float32Array, Float32Array]:
-        """What the spectrum measures, and how many times as much one energy would have.
+        """Compute the spectrum's line integrals, and the factor to those at one energy.
 
         Args:
-            paths_mm: float32 (m, ...) through the materials; negative ones, of voxels below zero,
-                harden nothing.
+            paths_mm: float32 (m, ...) through the materials; negative ones, of voxels
+                below zero, harden nothing.
 
         Returns:
             Two float32 arrays (...).
@@ -206,29 +209,31 @@ def require_apart(materials: Sequence[Substance], mu: FloatArray) -> None:
 
 
 ROUNDS, SETTLED = 8, 0.01
-"""Simulations and reconstructions at most, and the mean change of the scatter, relative to its
-mean, at which they end."""
+"""Largest number of simulations and reconstructions, and the mean relative change of
+the scatter at which they end."""
 ROUND_DEG, ROUND_NODES, ROUND_ERROR = 20.0, 240, 0.05
-"""Of the simulations in a round, at least (angle, error) and at most (nodes): they only have to say
-what the object is; the scatter that is subtracted in the end is simulated as the settings say."""
+"""Least angle step [deg], largest number of nodes and relative error of the
+simulations in a round, which only have to find the object. The scatter that is
+subtracted in the end is simulated by the settings."""
 MOST, OFTEN = 0.9, 0.001
-"""Part of a pixel's signal that is taken for scatter at most, and part of the pixels that may reach
-it without a warning."""
+"""Largest part of a pixel's signal that counts as scatter, and the share of pixels
+that may reach it without a warning."""
 BLACK: Final = 80.0
-"""Line integral of a pixel that nothing reaches; its transmission still has a finite inverse."""
+"""Line integral of a pixel without signal; its transmission still has a finite
+inverse."""
 FINER: Final = 4
-"""Voxels of FDK's grid, the whole field of view, for each of the settings'."""
+"""Voxels of FDK's grid, the complete field of view, per voxel of the settings' grid."""
 AIR: Final = 0.15
-"""Attenuation, relative to the thinnest material's, below which a voxel is empty."""
+"""Attenuation below which a voxel is empty, relative to the thinnest material's."""
 UNLIKE: Final = 0.25
-"""Relative difference of attenuation that casts doubt on the materials named."""
+"""Relative difference of attenuation from which on the named materials are doubtful."""
 APART: Final = 0.05
-"""Relative difference of attenuation at least, by which two materials are told apart."""
+"""Least relative difference of attenuation by which two materials are separated."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scatterer:
-    """What was found to scatter in a scan.
+    """The scattering object that was reconstructed from a scan.
 
     Attributes:
         thing: its voxels.
@@ -248,12 +253,13 @@ def without_scatter(
     kV: float,
     settings: ScatterSettings | None = None,
 ) -> Float32Array:
-    """Line integrals of a circular scan with the scatter taken out.
+    """Subtract the scatter from line integrals of a circular scan.
 
     Args:
         line_integrals: (n, rows, cols), of the signal over the open beam's.
         cone_vec: ConeVec or (n, 12) [mm].
-        chain: tube and panel, and the materials that the object is made of (see `scatterer_of`).
+        chain: tube and panel, and the materials that the object is made of (see
+            `scatterer_of`).
         kV: tube voltage.
         settings: of the simulation.
 
@@ -261,7 +267,8 @@ def without_scatter(
         float32 (n, rows, cols).
 
     Raises:
-        GeometryError: FDK cannot use the trajectory, or the source is in the object's box.
+        GeometryError: FDK cannot use the trajectory, or the source is in the object's
+            box.
         LimitError: no material, two that attenuate alike, or no spectrum for `kV`.
 
     Example:
@@ -283,11 +290,12 @@ def without_scatter(
 
 
 def subtracted(line_integrals: Float32Array, scatter: Float32Array) -> Float32Array:
-    """Line integrals without scatter.
+    """Subtract scatter from line integrals.
 
     Args:
         line_integrals: (rows, cols) of the signal over the open beam's.
-        scatter: (rows, cols), in units of the open beam; at most `MOST` of the signal is taken.
+        scatter: (rows, cols), in units of the open beam; at most `MOST` of the signal is
+            taken.
     """
     over = np.exp(np.minimum(line_integrals, np.float32(BLACK)))
     part = np.minimum(scatter * over, np.float32(MOST))
@@ -349,7 +357,7 @@ def scatterer_of(
 
 
 def volume_of(stack: Float32Array, cone_vec: ConeVec, grid: Grid) -> Volume:
-    """FDK of straightened line integrals, smoothed."""
+    """Reconstruct straightened line integrals by FDK and smooth the volume."""
     shape = shape_of(stack)
     truncation = truncation_of(stack.__getitem__, cone_vec, shape)
     volume = fdk_parts(
@@ -359,15 +367,20 @@ def volume_of(stack: Float32Array, cone_vec: ConeVec, grid: Grid) -> Volume:
 
 
 def shape_of(stack: Float32Array) -> tuple[int, int]:
-    """(rows, cols) of a stack."""
+    """Return (rows, cols) of a stack."""
     return int(stack.shape[1]), int(stack.shape[2])
 
 
 def attenuations(
     chain: Chain, kV: float
 ) -> tuple[FloatArray, Callable[[Float32Array], Float32Array]]:
-    """Attenuation of the materials at one energy, (m,) [1/mm], and what straightens line integrals
-    to that of the first one."""
+    """Compute the materials' attenuation at one energy and a function to straighten
+    integrals.
+
+    Returns:
+        (m,) [1/mm], and a function that converts line integrals to those of the first
+            material.
+    """
     signal = weights_of(chain, kV)[0]
     energies = np.arange(len(signal))
     at = round(float(energies @ signal / signal.sum()))
@@ -380,7 +393,7 @@ def attenuations(
 
 
 def object_in(volume: Volume, chain: Chain, mu: FloatArray) -> Object:
-    """The occupied box of a volume as amounts of the materials."""
+    """Convert the occupied box of a volume to amounts of the materials."""
     order = np.argsort(mu)
     knots = np.concatenate([[0.0], mu[order]])
     values = np.where(volume.data > AIR * knots[1], volume.data, np.float32(0.0))
@@ -399,10 +412,10 @@ def object_in(volume: Volume, chain: Chain, mu: FloatArray) -> Object:
 
 
 def doubts_about(dark: float, volume: Volume, chain: Chain, mu: FloatArray) -> list[str]:
-    """What is doubtful about a correction, in sentences.
+    """List doubts about a correction, in sentences.
 
     Args:
-        dark: part of the pixels whose signal would be nearly all scatter.
+        dark: share of the pixels whose signal would be nearly all scatter.
         volume: reconstructed without the scatter.
         chain: with the materials named.
         mu: (m,) their attenuation in the volume [1/mm].

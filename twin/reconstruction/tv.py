@@ -42,13 +42,14 @@ from flexdt.twin.signatures import public, with_arguments_of
 WEIGHT = 1e-2
 """Default strength as a part of max(A' b); see docs/operator.md for how it was chosen."""
 INNER = 10
-"""Steps of the dual method an iteration."""
+"""Steps of the dual method in an iteration."""
 WORTH_A_PASS = 0.05
-"""Part of the cost that a pass through subsets must gain, or the number of subsets is halved."""
+"""Least share of the cost that a pass through subsets must gain; else their number is
+halved."""
 NORM = 1e-2
-"""Tolerance of the operator's norm."""
+"""Relative tolerance of the operator's norm."""
 IN_A_ROW = 3
-"""Iterations that must gain little before it ends."""
+"""Consecutive iterations of little gain after which it ends."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +70,7 @@ class Minimised:
 
     @property
     def iterations(self) -> int:
-        """How many iterations there were."""
+        """Number of iterations."""
         return len(self.costs) - 1
 
     def __repr__(self) -> str:
@@ -95,24 +96,26 @@ def minimise_tv(
     watch: Watch | None = None,
     progress: Progress = None,
 ) -> Minimised:
-    """The volume of least squared residual plus total variation.
+    """Minimise the squared residual plus total variation.
 
     Args:
         projections: (n, rows, cols) line integrals.
         cone_vec: ConeVec or (n, 12) [mm].
         like: the grid, or a volume on it, whose values are not used.
         iterations: at most so many, passes through subsets among them.
-        weight: strength of the total variation as a part of max(A' b), which makes it independent
-            of the object's attenuation and of the number of views; 0 for none. More noise needs
-            more.
-        tolerance: it ends after three iterations in a row that each lower the cost by less than
-            this part of it; 0 for never.
+        weight: strength of the total variation as a part of max(A' b), which makes it
+            independent of the object's attenuation and of the number of views; 0 for
+            none. More noise needs more.
+        tolerance: it ends after three iterations in a row that each lower the cost by
+            less than this part of it; 0 for never.
         subsets: ordered subsets of views in the first passes; 1 for none.
         start: first guess on the same grid; zero by default.
         nonnegative: no value is below zero.
-        mask: (nz, ny, nx), where the object may be: all else is zero. Everywhere by default.
+        mask: (nz, ny, nx), where the object may be: all else is zero. Everywhere by
+            default.
         watch: called in every iteration.
-        progress: a bar after two seconds; False for none, or what takes the fraction done.
+        progress: a bar after two seconds; False for none, or what takes the fraction
+            done.
 
     Returns:
         Volume, costs and whether it converged.
@@ -155,7 +158,7 @@ def minimise_tv(
 @public
 @with_arguments_of(minimise_tv)
 def tv(*args: Any, **options: Any) -> Volume:
-    """Least squares with total variation, see `minimise_tv`, of which this is the volume.
+    """Reconstruct by least squares with total variation; the volume of `minimise_tv`.
 
     Examples:
         >>> scan = ConeVec.circular(sod=600, sdd=1000, angles=12, shape=(8, 8), pixel=1)
@@ -193,7 +196,7 @@ def _minimised(
     little = 0
 
     def tell(at: _At) -> bool:
-        """Note an iteration; whether the stopping rule says it is the last."""
+        """Record an iteration; return whether it is the last by the stopping rule."""
         nonlocal little
         problem.tell(watch, len(costs) - 1, iterations, at.rest)
         costs.append(at.cost)
@@ -226,21 +229,21 @@ def _minimised(
 
 
 def momentum(t: float) -> tuple[float, float]:
-    """The next t of accelerated steps, and how far to go beyond the point that was found."""
+    """Compute the next t of accelerated steps, and the factor of extrapolation."""
     new = (1 + math.sqrt(1 + 4 * t * t)) / 2
     return new, (t - 1) / new
 
 
 @dataclass(frozen=True, eq=False)
 class _At:
-    """A volume with its residual A x - b; the cost is nan where it is not known."""
+    """A volume with its residual A x - b; the cost is nan if unknown."""
 
     x: Float32Array
     rest: Float32Array
     cost: float = math.nan
 
     def beyond(self, last: _At, part: float) -> _At:
-        """The point so much further along the way from `last` to here; nothing is projected."""
+        """Extrapolate from `last` through this point by `part`; nothing is projected."""
         if part == 0.0:
             return self
         factor = np.float32(part)
@@ -263,12 +266,14 @@ class _Objective:
         return _At(x, rest, cost)
 
     def step(self, at: _At, step: float) -> Any:
-        """A step down the slope of the squares, and the proximal map of all the rest."""
+        """Take a step down the gradient of the squares, then the proximal map of the
+        rest.
+        """
         z = at.x - np.float32(step) * self.problem.spread(at.rest)
         return self.regular.proximal(z, step * self.strength)
 
     def subset_pass(self, x: Float32Array, step: float, count: int) -> Any:
-        """Such a step for each subset of views, and one proximal map in the end."""
+        """Take a step for each subset of views, and one proximal map in the end."""
         n = len(self.problem.geometry)
         x = x.copy()
         for k in far_apart(count):
@@ -289,7 +294,7 @@ class Regular:
 
     @classmethod
     def of(cls, like: Volume, nonnegative: bool, mask: npt.ArrayLike | None) -> Regular:
-        """For a grid, with all dual variables zero."""
+        """Create the regulariser of a grid, with all dual variables zero."""
         if mask is None:
             allowed = np.ones(like.shape, np.uint8)
         else:
@@ -305,11 +310,11 @@ class Regular:
         )
 
     def allow(self, x: Any) -> Any:
-        """The allowed values next to x."""
+        """Find the nearest allowed values to x."""
         return np.ascontiguousarray(np.maximum(x, self.lowest) * self.allowed, dtype=np.float32)
 
     def variation(self, x: Any) -> float:
-        """The total variation of x."""
+        """Compute the total variation of x."""
         from flexdt.twin.reconstruction.kernels import tv_kernels
 
         layers = np.empty(len(x))
@@ -318,7 +323,7 @@ class Regular:
         return float(layers.sum())
 
     def proximal(self, z: Any, theta: float) -> Any:
-        """The allowed x of least 1/2 sum((x - z)^2) + theta TV(x), nearly."""
+        """Find the allowed x of least 1/2 sum((x - z)^2) + theta TV(x), approximately."""
         if theta == 0.0:
             return self.allow(z)
         if isinstance(z, np.ndarray):
@@ -335,7 +340,7 @@ class Regular:
         return x
 
     def primal_step(self, z: Any, dual: Any, theta: np.float32, x: Any) -> None:
-        """See `tv_kernels`; into x."""
+        """Compute x from the dual variables; see `tv_kernels.primal_step`."""
         from flexdt.twin.reconstruction.kernels import tv_kernels
 
         for first, last in layer_portions(x):
@@ -344,7 +349,7 @@ class Regular:
             )
 
     def dual_step(self, x: Any, ahead: Any, rate: np.float32, further: np.float32) -> None:
-        """See `tv_kernels`; changes `dual` and `ahead`."""
+        """Update `dual` and `ahead`; see `tv_kernels.dual_step`."""
         from flexdt.twin.reconstruction.kernels import tv_kernels
 
         for first, last in layer_portions(x):
@@ -353,33 +358,33 @@ class Regular:
 
 @dataclass(frozen=True, eq=False)
 class DeviceRegular(Regular):
-    """The same on a CUDA device: every array but `scale` is a `DeviceArray`."""
+    """A `Regular` on a CUDA device: every array but `scale` is a `DeviceArray`."""
 
     @classmethod
     def of_host(cls, regular: Regular, like: Volume) -> DeviceRegular:
-        """The same there, with all dual variables zero."""
+        """Create the same on the device, with all dual variables zero."""
         allowed = DeviceArray.of_voxels(like.like(regular.allowed.astype(np.float32)))
         dual = gpu.demand(lambda: gpu.zeros(3 * allowed.flat.size))
         flat = DeviceArray.of_images(dual.reshape(1, 1, dual.size))
         return cls(regular.scale, regular.lowest, allowed, flat)
 
     def allow(self, x: Any) -> Any:
-        """See `Regular`."""
+        """Find the nearest allowed values to x; see `Regular`."""
         return np.maximum(x, self.lowest) * self.allowed
 
     def variation(self, x: Any) -> float:
-        """See `Regular`."""
+        """Compute the total variation of x; see `Regular`."""
         found = x.copy()
         self._run("lengths", x.flat, *self._form, found.flat)
         return float(found.sum())
 
     def primal_step(self, z: Any, dual: Any, theta: np.float32, x: Any) -> None:
-        """See `Regular`."""
+        """Compute x from the dual variables; see `Regular`."""
         last = (self.lowest, self.allowed.flat, x.flat)
         self._run("primal_step", z.flat, dual.flat, theta, *self._form, *last)
 
     def dual_step(self, x: Any, ahead: Any, rate: np.float32, further: np.float32) -> None:
-        """See `Regular`."""
+        """Update `dual` and `ahead`; see `Regular`."""
         self._run("dual_step", x.flat, ahead.flat, self.dual.flat, rate, further, *self._form)
 
     @property

@@ -18,27 +18,30 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection.volume import Accuracy, Volume
 
 Neighbours = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Float32Array]
-"""Of each place on an axis: its lower and its upper node, and the weight of the upper one."""
+"""For each place on an axis its lower node, its upper node, and the upper one's
+weight."""
 
 
 class SigmaOf(Protocol):
-    """What the noise in a volume is computed from."""
+    """Source of the noise in a volume."""
 
     @abstractmethod
     def sigma(self, grid: Volume) -> Float32Array:
-        """Standard deviation at each voxel of a grid, (nz, ny, nx) [1/mm]."""
+        """Compute the standard deviation at each voxel of a grid, (nz, ny, nx) [1/mm]."""
 
 
 class BoundOf(Protocol):
-    """What the bias of a volume is computed from."""
+    """Source of the bias of a volume."""
 
     @abstractmethod
     def bound(self, grid: Volume) -> Float32Array | None:
-        """Bound at each voxel of a grid, (nz, ny, nx) [1/mm]; None where there is none."""
+        """Compute the bound at each voxel of a grid, (nz, ny, nx) [1/mm]; None if
+        unknown.
+        """
 
     @abstractmethod
     def accuracy(self, grid: Volume) -> Accuracy | None:
-        """Of the object's uniform regions in a grid; None where nothing is known of them."""
+        """Compute the accuracy of uniform regions in a grid; None if unknown."""
 
 
 def with_errors(

@@ -24,13 +24,13 @@ from flexdt.twin.projection import Volume
 from flexdt.twin.reconstruction.acquisition.trajectory import Circle, fan_angles, no_fdk, reach
 
 LEAST_SEEN: Final = 0.4
-"""Part of the weight of all views that must see a voxel. At the panel's upper and lower edge it is
-about half in a whole turn."""
+"""Least share of the weight of all views that must see a voxel. At the panel's upper
+and lower edge it is about half in a full turn."""
 ALL_LINES: Final = 0.97
-"""Part of the directions in which a voxel must be seen where the panel cuts the object off, less
-the arc that a view stands for."""
+"""Share of the directions in which a voxel must be seen where the panel cuts the
+object off, less the arc of one view."""
 MOST_VIEWS: Final = 360
-"""Coverage is judged by so many of the views at most, evenly over the circle."""
+"""Largest number of views by which coverage is judged, evenly over the circle."""
 
 
 def normalise_coverage(
@@ -82,17 +82,19 @@ def normalise_coverage(
 
 
 def first_and_steps(like: Volume) -> tuple[list[float], list[float]]:
-    """Centre of the first voxel and steps (x, y, z) [mm]."""
+    """Compute centre of the first voxel and steps (x, y, z) [mm]."""
     return [float(places[0]) for places in like.centers()], list(like.voxel_xyz)
 
 
 def lost_layers(data: Float32Array) -> int:
-    """Layers of a volume (nz, ny, nx) without a value, judged by every fourth voxel of a side."""
+    """Count the layers of a volume (nz, ny, nx) without a value, by every fourth voxel of
+    a side.
+    """
     return int(np.isnan(data[:, ::4, ::4]).all(axis=(1, 2)).sum())
 
 
 def layer_warnings(lost: int, layers: int) -> list[str]:
-    """A warning where some of a grid's layers are lost."""
+    """List a warning if some of a grid's layers are lost."""
     if not lost:
         return []
     return [
@@ -102,9 +104,9 @@ def layer_warnings(lost: int, layers: int) -> list[str]:
 
 
 DEPTHS = 64
-"""Depths at which shares are tabulated."""
+"""Number of depths at which shares are tabulated."""
 ENDS = 0.2
-"""Angle over which views count less and less towards the ends of the helix [rad]."""
+"""Angle over which views count less towards the ends of the helix [rad]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,10 +129,10 @@ class Sharing:
 
     @classmethod
     def of(cls, circle: Circle, cone_vec: ConeVec, shape: tuple[int, int], like: Volume) -> Sharing:
-        """Of upright panels of `shape` (rows, cols), for a grid.
+        """Compute the shares of upright panels of `shape` (rows, cols) for a grid.
 
         Raises:
-            GeometryError: some voxel is not seen from every side.
+            GeometryError: a voxel is not seen from every side.
         """
         rows, cols = shape
         away = cone_vec.normal * np.sign(cone_vec.source_detector_distance)[:, None]
@@ -157,12 +159,12 @@ class Sharing:
         return cls(circle, rows, scale, axis[:, None] + wide * np.array([-1.0, 1.0]), whole)
 
     def columns(self) -> FloatArray:
-        """What the kernel needs to look a depth up, (n, 2): the first, and how many a mm."""
+        """Compute the kernel's depth lookup, (n, 2): first depth, and depths a mm."""
         first, last = self.depth.T
         return np.column_stack([first, (DEPTHS - 1) / (last - first)])
 
     def table(self, views: slice, rows: tuple[int, int]) -> Float32Array:
-        """Shares of rows first <= r < last at each depth, (n, DEPTHS, rows)."""
+        """Compute shares of rows first <= r < last at each depth, (n, DEPTHS, rows)."""
         first, last = self.depth[views].T[..., None]
         depth = first + (last - first) * np.linspace(0.0, 1.0, DEPTHS)
         turn = self.circle.rise * self.scale[views, None] / depth  # rows that a voxel sinks

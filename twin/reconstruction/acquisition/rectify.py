@@ -23,28 +23,28 @@ from flexdt.twin.reconstruction.acquisition.trajectory import no_fdk
 UPRIGHT = 1e-7
 """Largest slope of rows and columns of a panel that counts as upright."""
 FINER = 1.3
-"""Columns of an upright panel for each of the tilted panel's, in FDK: resampled twice, before the
-filter and after it, edges would come out wider."""
+"""Columns of an upright panel per column of the tilted one, in FDK: resampled twice,
+before the filter and after it, edges would be blurred."""
 SMALL_MM = 0.01
-"""Voxels below this are not rounded to whole micrometres."""
+"""Voxel size below which sizes are not rounded to micrometres [mm]."""
 FLAT = 1e-3
-"""Smallest horizontal part of a panel's normal that can be stood upright."""
+"""Least horizontal part of the normal of a panel that can be made upright."""
 
 
 def leans(cone_vec: ConeVec) -> bool:
-    """Whether rows are not horizontal, or columns not vertical."""
+    """Return whether rows are not horizontal, or columns not vertical."""
     slope_u = np.abs(cone_vec.u[:, 2]) / np.linalg.norm(cone_vec.u, axis=1)
     slope_v = np.linalg.norm(cone_vec.v[:, :2], axis=1) / np.linalg.norm(cone_vec.v, axis=1)
     return bool(max(slope_u.max(), slope_v.max()) > UPRIGHT)
 
 
 def is_upright(cone_vec: ConeVec) -> bool:
-    """Whether all rows are horizontal and all columns point down."""
+    """Return whether all rows are horizontal and all columns point down."""
     return not leans(cone_vec) and bool((cone_vec.v[:, 2] < 0).all())
 
 
 def on_its_side(cone_vec: ConeVec) -> bool:
-    """Whether columns are nearer to the horizontal than rows, over all views."""
+    """Return whether columns are nearer to the horizontal than rows, over all views."""
     steep = np.abs(np.stack([cone_vec.u[:, 2], cone_vec.v[:, 2]]))
     steep /= np.linalg.norm([cone_vec.u, cone_vec.v], axis=2)
     rows, columns = steep.mean(axis=1)
@@ -52,19 +52,20 @@ def on_its_side(cone_vec: ConeVec) -> bool:
 
 
 def swapped(cone_vec: ConeVec) -> ConeVec:
-    """The geometry of images whose rows and columns are swapped."""
+    """Return the geometry of images whose rows and columns are swapped."""
     return ConeVec.from_vectors(cone_vec.source, cone_vec.detector, cone_vec.v, cone_vec.u)
 
 
 def upright(cone_vec: ConeVec, finer: float = 1.0) -> ConeVec:
-    """Upright panels with the same centres and pitches, their backs turned the same way.
+    """Compute upright panels with the same centres, pitches and orientation of their
+    backs.
 
     Args:
         cone_vec: (n).
-        finer: columns for each of the panel's own; their pitch is narrower by as much.
+        finer: columns per column of the original panel, with a narrower pitch.
 
     Raises:
-        GeometryError: a panel that lies flat has no upright one.
+        GeometryError: a panel is horizontal.
     """
     away = cone_vec.normal * np.sign(cone_vec.source_detector_distance)[:, None]
     level = np.hypot(away[:, 0], away[:, 1])
@@ -84,12 +85,12 @@ def upright(cone_vec: ConeVec, finer: float = 1.0) -> ConeVec:
 def rectified(
     images: Float32Array, cone_vec: ConeVec, target: ConeVec, cols: int | None = None
 ) -> Float32Array:
-    """Images resampled (Lanczos) onto the panels of `target`, which has the same sources.
+    """Resample images (Lanczos) onto the panels of `target`, which has the same sources.
 
     Args:
         images: (n, rows, cols).
         cone_vec, target: n rows each.
-        cols: of the target's panels; default: as many as there are.
+        cols: of the target's panels; default: as many as in images.
     """
     from flexdt.twin.reconstruction.kernels import fdk_kernels
 
@@ -106,7 +107,9 @@ def rectified(
 def homography(
     old: FloatArray, new: FloatArray, shape: tuple[int, int], new_shape: tuple[int, int]
 ) -> FloatArray:
-    """(3, 3): homogeneous (column, row) on `new` to those on `old`, pixel centres integer."""
+    """Compute (3, 3): homogeneous (column, row) on `new` to those on `old`, centres
+    integer.
+    """
 
     def plane(row: FloatArray, rows: int, cols: int) -> FloatArray:
         first = row[3:6] - row[0:3] - (cols - 1) / 2 * row[6:9] - (rows - 1) / 2 * row[9:12]
@@ -116,13 +119,14 @@ def homography(
 
 
 def field_of_view(cone_vec: ConeVec, shape: tuple[int, int], voxel_mm: float | None = None) -> Grid:
-    """The box about the object frame's z axis that all views together can fill.
+    """Compute the largest box about the object frame's z axis that all views together can
+    fill.
 
     Args:
         cone_vec: the scan.
         shape: detector (rows, cols).
-        voxel_mm: default: the pixel's size at the rotation axis, to 1 um, or to three digits where
-            it is below 10 um.
+        voxel_mm: default: the pixel's size at the rotation axis, to 1 um, or to three
+            digits where it is below 10 um.
 
     Raises:
         GeometryError: the axis is not in front of the source, or no voxel is so large.
@@ -158,7 +162,7 @@ def field_of_view(cone_vec: ConeVec, shape: tuple[int, int], voxel_mm: float | N
 
 
 def rows_needed(cone_vec: ConeVec, shape: tuple[int, int], like: Volume) -> tuple[int, int]:
-    """Rows first <= r < last in which the volume's shadow lies in some view (a few to spare).
+    """Find rows first <= r < last with the volume's shadow in some view (a few to spare).
 
     There is one more above the panel and one below it: pixels see beyond their centres.
     """
@@ -175,7 +179,9 @@ def rows_needed(cone_vec: ConeVec, shape: tuple[int, int], like: Volume) -> tupl
 def window(
     cone_vec: ConeVec, shape: tuple[int, int], rows: tuple[int, int], cols: tuple[int, int]
 ) -> ConeVec:
-    """The geometry of rows and columns first <= i < last, which may lie off the panel."""
+    """Compute the geometry of rows and columns first <= i < last, which may be off the
+    panel.
+    """
     down, right = ((sum(part) - size) / 2 for part, size in zip((rows, cols), shape, strict=True))
     centre = cone_vec.detector + down * cone_vec.v + right * cone_vec.u
     return ConeVec.from_vectors(cone_vec.source, centre, cone_vec.u, cone_vec.v)

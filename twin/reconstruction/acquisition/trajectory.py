@@ -24,25 +24,27 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 FLATNESS = 0.03
 """Largest deviation of the sources from a horizontal circle, relative to its radius."""
 TAPER = 4.0
-"""Width of the weights' transition, over how much further the detector reaches to one side."""
+"""Width of the weights' transition, relative to the detector's additional reach on one
+side."""
 NARROWEST = 24
 """Least width of that transition [columns]."""
 LEAST = 3e-3
 """Confidence in the rays at the panel's near edge, relative to that in their opposites. It decides
 only where an opposite ray was hardly seen: next to a gap of the angles."""
 MOST_COLUMNS = 8
-"""A panel moved to one side is continued to at most so many times its columns."""
+"""Largest width to which a panel moved to one side is continued, over its columns."""
 LEVEL = 1e-3
-"""Rise over a scan, relative to the radius, up to which it is a circle."""
+"""Largest rise over a circular scan, relative to the radius."""
 UNSTEADY = 0.05
 """Largest deviation of a helix from a steady rise, relative to the rise in a turn."""
 UNEVEN, MOST_UNEVEN = 3.0, 8.0
-"""Steps between neighbouring views, relative to the usual one, that are gaps: the first where the
-views behind cover all of these, as of a scan that left some out; else the second, as of views at
-random."""
+"""Steps between neighbouring views, relative to the usual one, from which on they are
+gaps. The first holds where the views behind cover all of them, as in a scan that left
+some out; else the second, as for random views."""
 RAMP = 0.35
-"""Angle over which the confidence in views falls towards a gap; a fan of as much on either side is
-wide, so that views behind a gap that covers it do so for any panel [rad]."""
+"""Angle over which the confidence in views falls towards a gap; a fan of as much on
+either side is wide, so that views behind a gap that cover it do so for any panel
+[rad]."""
 TURN = 2 * np.pi
 
 
@@ -70,11 +72,11 @@ class Circle:
 
     @property
     def full(self) -> bool:
-        """Whether the views see the object from all around."""
+        """True if the views see the object from all around."""
         return not len(self.gaps)
 
     def from_gap(self, angle: FloatArray) -> FloatArray:
-        """Angles from places on the circle to the nearest gap, zero within, else infinite [rad]."""
+        """Compute angles to the nearest gap, zero within it, infinite without gaps [rad]."""
         if self.full:
             return np.full_like(angle, np.inf)
         first, last = self.gaps.T
@@ -85,13 +87,13 @@ class Circle:
 
 
 def no_fdk(why: str, asked: object, allowed: object) -> GeometryError:
-    """The error that FDK cannot use a trajectory, and what can."""
+    """Make the error that FDK cannot use a trajectory, with those it can use."""
     what_can = "the iterative methods (sirt, sart, cgls, em) take any trajectory"
     return GeometryError(f"{why}; {what_can}", {"asked": asked, "allowed": allowed})
 
 
 def circle_of(cone_vec: ConeVec) -> Circle:
-    """The circle or the helix on which the sources of a scan lie.
+    """Find the circle or helix of a scan's sources.
 
     Raises:
         GeometryError: fewer than three views, or neither about an axis along z.
@@ -120,8 +122,10 @@ def circle_of(cone_vec: ConeVec) -> Circle:
 
 
 def distinct_angles(circle: Circle) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-    """First views of different angles, in the order of these, and which of them each view repeats;
-    neither depends on the order in which views are listed but in which of equals is the first.
+    """Find the first views of different angles, in their order, and the one each view
+    repeats.
+
+    Neither depends on the order of views, except in which of equal ones is the first.
     """
     angle = circle.angle.round(9) if circle.rise else _on_circle(circle.angle)
     _, first, same = np.unique(angle, return_index=True, return_inverse=True)
@@ -129,16 +133,14 @@ def distinct_angles(circle: Circle) -> tuple[npt.NDArray[np.intp], npt.NDArray[n
 
 
 def _on_circle(angle: FloatArray) -> FloatArray:
-    """Angles so rounded that those of one place are equal: a little below zero is zero."""
+    """Round angles so that those of one place are equal: slightly below zero is zero."""
     return np.asarray(angle.round(9) % round(TURN, 9))
 
 
 def mean_image(
     image: Callable[[int], npt.NDArray[np.generic]], views: npt.NDArray[np.intp]
 ) -> Float32Array:
-    """The mean of some views' images: of those that repeat an angle, none counts by its place in
-    the list.
-    """
+    """Average some views' images; among repeated angles, the order has no effect."""
     total = np.asarray(image(int(views[0])), np.float32)
     for view in views[1:].tolist():
         total = total + np.asarray(image(view), np.float32)
@@ -146,7 +148,7 @@ def mean_image(
 
 
 def _turn(azimuth: FloatArray, centre: FloatArray, radius: float) -> Circle:
-    """A circle with its sources at angles from 0 to 2 pi."""
+    """Make a circle with its sources at angles from 0 to 2 pi."""
     at, same = np.unique(_on_circle(azimuth), return_inverse=True)
     # From each place to the next one; views at one place share what it stands for.
     ahead = np.diff(at, append=at[0] + TURN)
@@ -164,8 +166,9 @@ def _turn(azimuth: FloatArray, centre: FloatArray, radius: float) -> Circle:
 
 
 def _usual(steps: FloatArray) -> float:
-    """The usual one of some steps: a third of what they cover together lies in narrower ones,
-    however many turns lie beside each other."""
+    """Find the usual step: a third of the total is in narrower ones, even with repeated
+    turns.
+    """
     ordered = np.sort(steps)
     covered = np.cumsum(ordered)
     return float(ordered[int(np.searchsorted(covered, covered[-1] / 3))]) if len(steps) else TURN
@@ -174,7 +177,7 @@ def _usual(steps: FloatArray) -> float:
 def _helix(
     azimuth: FloatArray, height: FloatArray, centre: FloatArray, radius: float
 ) -> Circle | None:
-    """The helix of sources that rise steadily for a turn or more, without a gap; else None."""
+    """Fit a helix that rises steadily for a turn or more without a gap; else None."""
     order = np.argsort(height, kind="stable")
     run = np.empty(len(order))
     run[order] = np.unwrap(azimuth[order])
@@ -199,12 +202,13 @@ def _helix(
 
 
 def redundancy(circle: Circle, cone_vec: ConeVec, cols: int, *, beyond: bool = False) -> FloatArray:
-    """Weights (n, cols) of rays so that every line counts once, with its opposite or alone.
+    """Compute weights (n, cols) of rays so that a line and its opposite together count
+    once.
 
-    A ray and its opposite share by the confidence in each (Noo et al., Phys. Med. Biol. 47 (2002)
-    2525), which falls smoothly to nothing towards a gap of the angles, and towards the near edge
-    of a panel moved to one side; with gaps that is where an object lies `beyond` the near edge.
-    Around a whole turn of a panel in the middle each counts 1/2.
+    A ray and its opposite share by the confidence in each (Noo et al., Phys. Med. Biol.
+    47 (2002) 2525), which falls smoothly to nothing towards a gap of the angles, and
+    towards the near edge of a panel moved to one side; with gaps that is where an object
+    reaches `beyond` the near edge. In a full turn of a centred panel each counts 1/2.
 
     Raises:
         GeometryError: some lines are not seen from either side.
@@ -233,17 +237,18 @@ def redundancy(circle: Circle, cone_vec: ConeVec, cols: int, *, beyond: bool = F
 
 
 def narrow_overlap(circle: Circle, cone_vec: ConeVec, cols: int) -> bool:
-    """Whether a panel moved aside sees few columns beyond the axis."""
+    """Return whether a panel moved aside sees few columns beyond the axis."""
     low, high = reach(fan_angles(circle, cone_vec, cols))
     column = (low + high) / cols
     return abs(high - low) > column and min(low, high) < 2 * NARROWEST * column
 
 
 def axis_between(circle: Circle, cone_vec: ConeVec, shape: tuple[int, int]) -> ConeVec:
-    """Panels moved by up to a quarter of a column: the axis falls on a column or between two.
+    """Move panels by up to a quarter of a column: the axis is on a column or between two.
 
-    Where the weights of a ray and its opposite change within few columns, what they add to the
-    filtered rows is large, odd about the axis, and cancels only if both are sampled alike.
+    Where the weights of a ray and its opposite change within few columns, what they add
+    to the filtered rows is large, odd about the axis, and cancels only if both are
+    sampled alike.
     """
     at = cone_vec.project_points([[*circle.centre, 0.0]], shape)[:, 0, 0]
     moved = np.round(2.0 * at) / 2.0 - at
@@ -253,7 +258,7 @@ def axis_between(circle: Circle, cone_vec: ConeVec, shape: tuple[int, int]) -> C
 
 
 def _confidence(circle: Circle, angle: FloatArray) -> FloatArray:
-    """From 0 to 1, in views at angles from a gap."""
+    """Compute the confidence, 0 to 1, of views at angles from a gap."""
     from_gap = circle.from_gap(angle)
     return np.asarray(np.sin(np.pi / 2 * np.minimum(from_gap / RAMP, 1.0)) ** 2 + 1e-12)
 
@@ -278,22 +283,27 @@ def _check_covered(circle: Circle, widest: float) -> None:
 
 
 def _unseen(gaps: FloatArray, widest: float) -> float:
-    """By how much gaps overlap with what is behind others, up to an angle of the fan [rad]."""
+    """Compute the overlap of gaps with the opposites of others, up to a fan angle [rad]."""
     width, middle = np.diff(gaps)[:, 0], gaps.mean(axis=1)
     apart = np.abs((middle[:, None] - middle) % TURN - np.pi)  # of a gap and what is behind another
     return float(((width[:, None] + width) / 2 + 2 * widest - apart).max(initial=-TURN))
 
 
 def reach(fan: FloatArray) -> tuple[float, float]:
-    """Fan angles (n, cols) that all views have on the clockwise side and on the other [rad]."""
+    """Compute fan angles that all views have on the clockwise side and on the other
+    [rad].
+
+    Args:
+        fan: (n, cols) [rad].
+    """
     return -float(fan.min(axis=1).max()), float(fan.max(axis=1).min())
 
 
 def columns_beyond(circle: Circle, cone_vec: ConeVec, cols: int) -> tuple[int, int]:
-    """Columns before the first and after the last in which a panel moved to one side is continued.
+    """Count the columns before the first and after the last to continue a shifted panel.
 
-    The filter's response to what the panel saw goes on beyond its near edge. Voxels whose shadow
-    falls there need it, out to where the panel ends on the other side.
+    The filter's response to the panel's signal continues beyond its near edge. Voxels
+    whose shadow falls there need it, as far out as the panel ends on the other side.
     """
     widest = max(reach(fan_angles(circle, cone_vec, cols)))
     source = cone_vec.source[:, :2]
@@ -315,8 +325,10 @@ def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def fan_angles(circle: Circle, cone_vec: ConeVec, cols: int) -> FloatArray:
-    """Horizontal angle of each column's ray from the line source to axis, (n, cols) [rad],
-    positive counter-clockwise seen from above.
+    """Compute the horizontal angle of each column's ray from the line source to axis.
+
+    Returns:
+        (n, cols) [rad], positive counter-clockwise seen from above.
     """
     source = cone_vec.source[:, :2]
     inward = circle.centre - source

@@ -36,17 +36,17 @@ from flexdt.twin.reconstruction.acquisition.trajectory import (
 )
 
 SAMPLES = 48
-"""Views, and bins of columns, that the prism is fitted to, at most: 2304 rays for six numbers, in
-milliseconds. The outermost bin is also what is called an edge."""
+"""Largest number of views, and of bins of columns, that the prism is fitted to: 2304
+rays for six numbers, in milliseconds. The outermost bin is the edge."""
 BANDS = 8
-"""Bands of rows with a prism of their own: few enough to average noise, and an outline changes
-little within an eighth of the panel."""
+"""Number of bands of rows with their own prism: few enough to average noise, and an
+outline changes little within an eighth of the panel."""
 REACH = 4.0
-"""Largest half axis of a prism over the radius of the field of view: wider ones look alike there.
-Rows are then continued by at most twice their length on either side."""
+"""Largest half axis of a prism over the radius of the field of view: wider ones look
+alike there. Rows are then continued by at most twice their length on either side."""
 SIGNIFICANT = 4.0
-"""Standard deviations of noise beyond which a value at an edge counts as truncation: of thousands
-of bands, views and edges none is beyond by chance."""
+"""Standard deviations of noise beyond which a value at an edge counts as truncation:
+of thousands of bands, views and edges none is beyond by chance."""
 ACCURACY = 0.01
 """Relative error of densities that is taken for none. The best quarter of the rays may
 deviate from the prism by half of it: what deviated by less was right within 1 %, and outlines that
@@ -54,7 +54,7 @@ were up to 4 % off (an octagon of twice the field of view) deviate by 0.6 % and 
 at the edges is nothing."""
 
 EDGE_BINS = 2
-"""Bins of columns at either edge that show the same where no object is."""
+"""Bins of columns at either edge that have one value where no object is."""
 MAX_SPREAD, MAX_SLOPE = 0.02, 0.003
 """Largest standard deviation of a view's edges over the contrast of the object, and largest step
 between these bins over their values: a cylinder of four times the panel has just that slope."""
@@ -77,14 +77,20 @@ class Prism:
 
     @classmethod
     def of(cls, x: FloatArray, field: float) -> Prism:
-        """Of the numbers of a fit (6,), in units of the field of view's radius [mm]: centre, the
-        logarithms of the diagonal of `to_disc`, its other element, logarithm of the attenuation.
+        """Make a prism from the numbers of a fit (6,).
+
+        Args:
+            x: in units of `field`: centre, the logarithms of the diagonal of `to_disc`,
+                its other element, logarithm of the attenuation.
+            field: radius of the field of view [mm].
         """
         to_disc = np.array([[np.exp(x[2]), 0.0], [x[4], np.exp(x[3])]]) / field
         return cls(x[:2] * field, to_disc, float(np.exp(x[5])))
 
     def integrals(self, source: FloatArray, rays: FloatArray) -> FloatArray:
-        """Line integrals (...) in the plane, of `rays` (..., 2) from `source` (..., 2) [mm]."""
+        """Compute line integrals (...) in the plane, of `rays` (..., 2) from `source`
+        (..., 2) [mm].
+        """
         start, along = (source - self.centre) @ self.to_disc.T, rays @ self.to_disc.T
         squared, middle = (along * along).sum(axis=-1), (start * along).sum(axis=-1)
         inside = middle * middle - squared * ((start * start).sum(axis=-1) - 1.0)
@@ -95,12 +101,14 @@ class Prism:
 
     @property
     def numbers(self) -> FloatArray:
-        """What kernels need, (6,): centre, elements (0, 0), (1, 0), (1, 1), attenuation."""
+        """Numbers for the kernels, (6,): centre, elements (0, 0), (1, 0), (1, 1),
+        attenuation.
+        """
         (first, _), (low, second) = self.to_disc
         return np.array([*self.centre, first, low, second, self.attenuation])
 
     def rim(self) -> FloatArray:
-        """(72, 3) points around it [mm]."""
+        """Compute (72, 3) points around it [mm]."""
         turn = np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)
         disc = np.stack([np.cos(turn), np.sin(turn)])
         return np.pad(np.linalg.solve(self.to_disc, disc).T + self.centre, ((0, 0), (0, 1)))
@@ -128,19 +136,19 @@ class Truncation:
 
     @property
     def nothing(self) -> Truncation:
-        """The same panel, of an object that it sees whole."""
+        """The same panel for an object that it sees completely."""
         none = np.zeros(1, dtype=bool)
         return replace(self, rows=np.zeros(1), prisms=(None,), cut_off=none, others=())
 
     @property
     def explained(self) -> bool:
-        """Whether a prism stands for each band whose rows are continued."""
+        """True if each band whose rows are continued has a prism."""
         return all(p is not None for p, cut in zip(self.prisms, self.cut_off, strict=True) if cut)
 
     @property
     def otherwise(self) -> Truncation:
-        """Rows continued in another way: they fade out, or follow the best of the prisms that do
-        not explain what was seen, or fade out later.
+        """The same with rows continued in another way: they fade out, or follow the best
+        of the prisms that do not explain the images, or fade out later.
         """
         if self.explained:
             return replace(self, prisms=(None,) * len(self.prisms))
@@ -149,11 +157,13 @@ class Truncation:
 
     @property
     def later(self) -> Truncation:
-        """What no prism explains at the edges fades out later."""
+        """The same where edge values that no prism explains fade out later."""
         return replace(self, fade=2.0 * self.fade)
 
     def columns(self, cone_vec: ConeVec, cols: int) -> tuple[int, int]:
-        """Columns before the first and after the last into which the object's shadow reaches."""
+        """Count the columns before the first and after the last that the object's shadow
+        reaches.
+        """
         most, before, after = 2.0 * cols, 0.5 * cols, 0.5 * cols
         middle_row = ConeVec(cone_vec.rows)  # without the shape of the panel
         for prism in (one for one in self.prisms if one is not None):
@@ -219,12 +229,12 @@ class Continuation:
     fade: FloatArray
 
     def of(self, which: slice | npt.NDArray[np.intp]) -> Continuation:
-        """Of some of the views."""
+        """Select some of the views."""
         return replace(self, plane=self.plane[which])
 
     @classmethod
     def empty(cls, views: int, rows: int, wide: int) -> Continuation:
-        """Nothing beyond the edges."""
+        """Make a continuation with nothing beyond the edges."""
         none = np.zeros(rows)
         return cls(
             0, np.zeros((views, 6)), np.zeros((1, 6)), none.astype(np.intp), none, none,
@@ -235,7 +245,7 @@ class Continuation:
 def truncation_of(
     image: Callable[[int], npt.NDArray[np.generic]], cone_vec: ConeVec, shape: tuple[int, int]
 ) -> Truncation | None:
-    """What of the object lies beyond the panel's edges, judged by some views of a scan.
+    """Estimate the object beyond the panel's edges from some views of a scan.
 
     Args:
         image: gives the line integrals of a view, (rows, cols), by its number.
@@ -243,7 +253,7 @@ def truncation_of(
         shape: (rows, cols).
 
     Returns:
-        For `fdk_parts`; None where the panel saw the whole object.
+        For `fdk_parts`; None if the panel saw the complete object.
     """
     circle = circle_of(cone_vec)  # of all: fewer may seem to close a turn that is open
     places, same = distinct_angles(circle)
@@ -279,7 +289,7 @@ def truncation_of(
 
 
 def _seen_beyond(images: Sequence[Float32Array], there: npt.NDArray[np.bool_]) -> bool:
-    """Whether something that is no noise is seen in some columns of each view (n, cols)."""
+    """Return whether some columns (n, cols) of the views show more than noise."""
     from scipy.ndimage import uniform_filter
 
     rows, cols = images[0].shape
@@ -300,7 +310,15 @@ def _fitted(
     edges_that_count: npt.NDArray[np.bool_],
     helix: bool,
 ) -> Truncation | None:
-    """As `truncation_of`, of upright panels."""
+    """Fit the object beyond the edges of upright panels; see `truncation_of`.
+
+    Args:
+        images: line integrals of some views.
+        cone_vec: of these views.
+        shape: (rows, cols).
+        edges_that_count: edges at which an object may be cut off.
+        helix: the scan is a helix.
+    """
     rows, cols = shape
     limits = np.linspace(0, rows, min(BANDS, rows) + 1).round().astype(int)
     bins = np.linspace(0, cols, min(SAMPLES, cols) + 1).round().astype(int)
@@ -336,8 +354,10 @@ def _fitted(
 
 
 def _open_beam(seen: FloatArray) -> bool:
-    """Whether both edges show one value in each view, in all rows and without a slope: an open beam
-    that is not the flat field's, and no object, whose outline slopes.
+    """Return whether both edges show an open beam that differs from the flat field.
+
+    It has one value in each view, in all rows and without a slope; an object's outline
+    slopes.
 
     Args:
         seen: (views, bands, bins) line integrals.
@@ -354,17 +374,21 @@ def _open_beam(seen: FloatArray) -> bool:
 
 
 def _noise(lines: npt.NDArray[np.floating]) -> float:
-    """Standard deviation of noise in lines (..., k) that are smooth without it."""
+    """Estimate the standard deviation of noise in lines (..., k) that are otherwise
+    smooth.
+    """
     bend = lines[..., 2:] - 2.0 * lines[..., 1:-1] + lines[..., :-2]
     # Of normal noise, a second difference's median is 1.65 standard deviations.
     return float(np.median(np.abs(bend))) / 1.65 if bend.size else 0.0
 
 
 def _cut_off(band: FloatArray, least: float, usual: float) -> npt.NDArray[np.bool_]:
-    """Whether the object goes on beyond the edges (2,), in some neighbouring views or in all.
+    """Find the edges (2,) beyond which the object continues, in some neighbouring views
+    or all.
 
-    The middle one of three views counts, and the mean of all, in which less noise hides it. Noise
-    is that of every other bin near the edge: detectors blur it over some columns.
+    The middle one of three views counts, and the mean of all, in which less noise hides
+    it. Noise is that of every other bin near the edge: detectors blur it over some
+    columns.
     """
     from scipy.ndimage import median_filter
 
@@ -383,14 +407,18 @@ def _cut_off(band: FloatArray, least: float, usual: float) -> npt.NDArray[np.boo
 def _fit(
     source: FloatArray, rays: FloatArray, seen: FloatArray, usual: float, near: Prism | None
 ) -> tuple[Prism | None, Prism | None]:
-    """The prism that explains what was seen, or else the one that does best.
+    """Fit the prism that explains the values, or else the best one.
 
     Args:
         source: (n, 1, 2) [mm].
         rays: (n, k, 2) from the source to columns of the panel, in the plane [mm].
         seen: (n, k) line integrals in the plane.
-        usual: a usual one of the object.
-        near: of a neighbouring band.
+        usual: usual line integral of the object.
+        near: prism of a neighbouring band.
+
+    Returns:
+        the prism that explains the values or None, and the best one that does not or
+            None.
     """
     from flexdt.twin.reconstruction.kernels.truncation_kernels import fit_prism
 
@@ -446,14 +474,15 @@ def _fit(
 
 
 def _edge(cols: int) -> int:
-    """Columns whose mean is the value at an edge."""
+    """Compute the number of columns whose mean is the value at an edge."""
     return max(1, cols // SAMPLES)
 
 
 def _rays(
     cone_vec: ConeVec, rows: FloatArray, columns: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Sources (n, 1, 2), rays to columns in the plane (n, k, 2), heights of rows (n, r) [mm].
+    """Compute sources (n, 1, 2), rays in the plane (n, k, 2) and heights of rows (n, r)
+    [mm].
 
     Args:
         cone_vec: (n) upright panels.

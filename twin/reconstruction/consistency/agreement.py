@@ -26,45 +26,49 @@ from flexdt.twin.reconstruction.consistency.suspects import (
 )
 
 MOST_MISFIT: Final = 2.5
-"""Residual over that of the volume's second reconstruction, above which images do not fit: right
-ones come to 0.8 to 1.9, hardened ones to 2.2 (`tests/studies/misfits.py --right`)."""
+"""Largest residual of fitting images, over that of the volume's second reconstruction:
+right ones have 0.8 to 1.9, hardened ones up to 2.2 (`tests/studies/misfits.py
+--right`)."""
 BETTER: Final = 0.92
-"""Misfit of an explanation over that of the scan as it is said to be, below which it is better:
-right scans come to 0.96 and more."""
+"""Misfit of an explanation, relative to the stated geometry's, below which it is
+better: right scans have 0.96 and more."""
 MUCH_BETTER: Final = 0.7
-"""The same where the panel cuts the object off, whose outer parts no volume holds, and where the
-coarse volume shows no edges."""
+"""The same where the panel cuts the object off, whose outer parts no volume holds, and
+where the coarse volume shows no edges."""
 DOUBTFUL: Final = 1.4
-"""Residual over that of the second reconstruction, below which images fit and nothing is tried:
-more than half of right scans; wrong ones that are named come to 1.44 and more."""
+"""Residual over that of the second reconstruction, below which images fit and nothing
+is tried: more than half of right scans; wrong ones that are detected have 1.44 and
+more."""
 TELLING: Final = 0.3
-"""Residual of the second reconstruction, over the images, below which it can tell: one of few views
-or few columns beyond the axis has larger ones."""
+"""Residual of the second reconstruction, over the images, below which it is reliable:
+one of few views or few columns beyond the axis has larger ones."""
 FEWEST_VIEWS: Final = 1.6
 """Views for a coarse column, below which streaks hide what does not fit."""
 LEAST: Final = 12
-"""Views and coarse columns below which a volume fits whatever it is made of: nothing is told."""
+"""Least number of views and coarse columns; with fewer a volume fits anything and no
+result is given."""
 UNEVEN: Final = 2.0
-"""Widest over usual angle of a view, above which views are at random and weights are rough."""
+"""Widest over usual angle of a view, above which views are random and weights are
+rough."""
 AS_GOOD: Final = 1.05
-"""Misfit over the best one's, up to which an explanation is as good."""
+"""Largest misfit of an equally good explanation, over the best one's."""
 ALL_NOISE: Final = 0.01
-"""Part of a residual that is no noise even where noise explains all of it."""
+"""Share of a residual that is never attributed to noise."""
 PROBE: Final = 0.35
-"""By how much the panel is moved in order to see on which side it fits better [coarse columns]."""
+"""Movement of the panel to find the side on which it fits better [coarse columns]."""
 FAR: Final = 3.0
-"""The same where images do not fit at all [coarse columns]."""
+"""The same if images do not fit at all [coarse columns]."""
 UNEXPLAINED: Final = (
     "No other direction, order, mirror or offset explains it; motion during the scan does, images "
     "in a wrong order, and images that are not line integrals of one object"
 )
 STEPS: Final = 7
-"""Times that the panel is moved on, twice as far each time."""
+"""Number of further movements of the panel, each twice as far."""
 
 
 @dataclass(frozen=True)
 class Contradiction:
-    """Images that do not fit their geometry.
+    """A contradiction between images and their geometry.
 
     Attributes:
         misfit: residual over what it should be.
@@ -79,6 +83,7 @@ class Contradiction:
     figures: tuple[str, ...] = ()
 
     def __str__(self) -> str:
+        """Describe the contradiction for the user."""
         said = (
             "no accuracy is claimed: images and geometry contradict each other; the volume, "
             f"projected again, differs from the images {self.misfit:.2g} times as much as it should"
@@ -112,7 +117,7 @@ def contradiction_of(scan: CoarseScan) -> Contradiction | None:
 
 @dataclass(frozen=True, eq=False)
 class _Tried:
-    """An explanation that was tried.
+    """One explanation with its misfit.
 
     Attributes:
         suspect: the explanation.
@@ -126,7 +131,7 @@ class _Tried:
 
 
 class _Trial:
-    """Explanations, compared with the scan as it is said to be."""
+    """Explanations compared with the stated geometry of the scan."""
 
     def __init__(self, scan: CoarseScan) -> None:
         self.scan = scan
@@ -142,7 +147,7 @@ class _Trial:
         self.even = bool(enough and step.max() <= UNEVEN * np.median(step))
 
     def verdict(self) -> Contradiction | None:
-        """What is wrong with the scan; None where nothing is."""
+        """Find the error of the scan's geometry; None if there is none."""
         if not self.telling.any() or self.excess < DOUBTFUL:
             return None
         unfit = self.whole and self.even and self.excess > MOST_MISFIT
@@ -158,19 +163,23 @@ class _Trial:
         return Contradiction(self.excess) if unfit else None
 
     def _explains(self, one: _Tried) -> bool:
-        """Whether the images fit an explanation, not only better than the scan."""
+        """Return whether the images fit an explanation, not only better than the scan."""
         if one.shown is None:
             return False
         expected = self._expected(one.shown, one.suspect.cone_vec)
         return self._excess(one.shown, expected) <= MOST_MISFIT
 
     def _expected(self, shown: Reprojection, cone_vec: ConeVec) -> FloatArray:
-        """Misfit of a volume's second reconstruction, infinite where there is none, (2,)."""
+        """Compute the misfit of a volume's second reconstruction, infinite without one,
+        (2,).
+        """
         again = Reprojection.of(self.scan, shown.again, cone_vec, None)
         return np.full(2, np.inf) if again is None else again.misfit()
 
     def _excess(self, shown: Reprojection, expected: FloatArray) -> float:
-        """How many times larger than expected: by edges, where the coarse volume shows them."""
+        """Compute the misfit relative to the expected one: by edges, if the coarse volume
+        has some.
+        """
         return float((shown.misfit(ALL_NOISE) / expected)[1 if self.telling[1] else 0])
 
     def _tried(self, suspect: Suspect) -> _Tried:
@@ -182,13 +191,13 @@ class _Trial:
         return _Tried(suspect, shown, float(np.exp(np.log(ratios).mean())))
 
     def _offset(self, columns: float) -> _Tried:
-        """The panel moved along its rows [coarse columns]."""
+        """Try the panel moved along its rows [coarse columns]."""
         said = f"by {columns * self.scan.binned[1]:+.1f} px along its rows"
         moved_panel = moved(self.scan.cone_vec, columns)
         return self._tried(Suspect("offset", self.scan.images, moved_panel, said))
 
     def _beside(self, unfit: bool) -> list[_Tried]:
-        """Panels moved along their rows towards the side where images fit better.
+        """Try panels moved along their rows towards the side where images fit better.
 
         Args:
             unfit: images do not fit, so that far places are tried as well.
@@ -217,7 +226,7 @@ class _Trial:
 
 
 def _lowest(known: dict[float, float]) -> float:
-    """Where a parabola through the squares of the three lowest scores has its vertex."""
+    """Find the vertex of a parabola through the squares of the three lowest scores."""
     places = sorted(known, key=known.__getitem__)[:3]
     squares = np.square([known[place] for place in places])
     if not np.isfinite(squares).all():

@@ -19,38 +19,41 @@ import numpy.typing as npt
 from flexdt.twin.geometry.conventions import Float32Array
 
 NEIGHBOURS: Final = 2
-"""Columns on either side that a pixel is compared with: of two bad columns, each has good ones."""
+"""Columns on either side that a pixel is compared with: each of two bad columns has
+good ones."""
 TIMES: Final = 8.0
 """Response of a bad pixel over the usual one about it."""
 LEAST: Final = 0.02
-"""Response of a bad pixel, at least: line integrals that are off by less do little harm."""
+"""Least response of a bad pixel: smaller errors of line integrals do little harm."""
 STEEPER: Final = 3.0
-"""By how much a slope may grow towards the panel's edges, whose pixels have one side alone."""
+"""Factor by which a slope may grow towards the panel's edges, whose pixels have one
+side alone."""
 LEAST_AT_EDGE: Final = 0.3
-"""The same of pixels at the panel's edges."""
+"""Least response of a bad pixel at the panel's edges."""
 PASSING: Final = 5
-"""One view of so many is left out, where a pixel lies farthest beyond its neighbours."""
+"""One of this many views is left out, that where a pixel is farthest beyond its
+neighbours."""
 BLOCK: Final = (8, 16)
 """Rows and columns over which the usual response is found."""
 AXIS_PART: Final = 0.2
 """Distance from the axis within which an object may hardly move, over the panel's columns."""
 WHOLE_COLUMN: Final = 0.9
-"""Part of a column's rows that are beyond their neighbours in a bad column there."""
+"""Least share of a bad column's rows that are beyond their neighbours."""
 DEVIATES: Final = 0.5
 """Distance beyond its neighbours, over its root mean square, from which a pixel deviates."""
 LASTING: Final = 0.75
-"""Part of the views in which a dead or hot pixel deviates, at least; a bead at the turn of its
-orbit does so in less than half of them."""
+"""Least share of the views in which a dead or hot pixel deviates; a bead at the turn
+of its orbit does so in less than half of them."""
 CHANGING: Final = 0.25
-"""Changes between deviating and not, over the views, of a flickering pixel, at least; an object's
-feature comes and goes once."""
+"""Least number of changes between deviating and not, over the views, of a flickering
+pixel; an object's feature comes and goes once."""
 MOST_PART: Final = 0.05
-"""Part of all pixels; where more seem bad, none is: the images are of another kind."""
+"""Largest share of bad pixels; above it none is bad: the images are of another kind."""
 
 
 @dataclass(frozen=True, eq=False)
 class BadPixels:
-    """Pixels whose values say nothing.
+    """Pixels whose values are unusable.
 
     Attributes:
         mask: (rows, cols).
@@ -101,7 +104,7 @@ def bad_pixels(views: Callable[[], Iterable[Float32Array]], axis_column: float) 
 def _outliers(
     views: Iterable[Float32Array], axis_column: float
 ) -> tuple[npt.NDArray[np.bool_], Float32Array]:
-    """Pixels that lie far beyond their neighbours, and by how much all do, (rows, cols)."""
+    """Find pixels far beyond their neighbours, and the excess of all, (rows, cols)."""
     along, down, near = _Usual(), _Usual(), slice(0, 0)
     for view in views:
         if min(view.shape) <= 2 * NEIGHBOURS:
@@ -138,7 +141,7 @@ def _lasting_or_flickering(
 
 
 def _largest_about(response: Float32Array) -> Float32Array:
-    """Half of the largest response of a pixel and its neighbours in the row, (rows, cols)."""
+    """Compute half of the largest response of a pixel and its neighbours in the row."""
     from scipy.ndimage import maximum_filter
 
     size = (1, 2 * NEIGHBOURS + 1)
@@ -146,7 +149,7 @@ def _largest_about(response: Float32Array) -> Float32Array:
 
 
 def _interpolated(view: Float32Array, mask: npt.NDArray[np.bool_]) -> Float32Array:
-    """An image with some pixels interpolated along their rows, (rows, cols)."""
+    """Interpolate some pixels of an image along their rows, (rows, cols)."""
     made = view.copy()
     columns = np.arange(view.shape[1])
     for row in np.flatnonzero(mask.any(axis=1) & ~mask.all(axis=1)):
@@ -156,7 +159,7 @@ def _interpolated(view: Float32Array, mask: npt.NDArray[np.bool_]) -> Float32Arr
 
 
 class _Usual:
-    """The root of the mean of squares without the largest of them, of images as they come."""
+    """Root mean square of images as they come, without the largest squares."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -164,7 +167,7 @@ class _Usual:
         self._largest: list[Float32Array] = []
 
     def add(self, square: Float32Array) -> None:
-        """One image of squares more, (rows, cols)."""
+        """Add one image of squares, (rows, cols)."""
         self.count += 1
         self._total = square.copy() if self._total is None else self._total + square
         if self.count % PASSING == 0:
@@ -176,7 +179,7 @@ class _Usual:
             rest = smaller
 
     def root(self) -> Float32Array:
-        """Root of the mean of the others, (rows, cols)."""
+        """Compute the root mean square of the others, (rows, cols)."""
         assert self._total is not None  # as there was an image
         rest = self._total - sum(self._largest, np.float32(0.0))
         mean = rest / np.float32(self.count - len(self._largest))
@@ -184,7 +187,7 @@ class _Usual:
 
 
 def _outlying(response: Float32Array) -> npt.NDArray[np.bool_]:
-    """Where a response is far above the usual one about it, (rows, cols)."""
+    """Find where a response is far above the usual one about it, (rows, cols)."""
     from scipy.ndimage import maximum_filter
 
     (rows, cols), (tall, wide) = response.shape, BLOCK
@@ -199,8 +202,9 @@ def _outlying(response: Float32Array) -> npt.NDArray[np.bool_]:
 
 
 def _beyond_neighbours(view: Float32Array) -> Float32Array:
-    """By how much pixels lie above or below all but one of their neighbours in the row, (rows,
-    cols): one of these may be bad, too.
+    """Compute the distance of pixels above or below all but one neighbour in the row.
+
+    One neighbour may be bad as well. Returns (rows, cols).
     """
     cols = view.shape[1]
     wide = np.pad(view, ((0, 0), (NEIGHBOURS, NEIGHBOURS)), "reflect")

@@ -14,19 +14,19 @@ from flexdt.twin.reconstruction.acquisition.truncation import Truncation
 from flexdt.twin.reconstruction.coarse_scan import CoarseScan
 
 MEDIAN_OF_SQUARES = 0.4549
-"""Median of the squares of normal deviates."""
+"""Median of the squares of standard normal deviates."""
 MORE_NOISE = 1.5
-"""Variance of noise over what its median says: few photons give more large deviations."""
+"""Variance of noise relative to the estimate by its median: few photons deviate more."""
 NOISE_OF_CHANGES = np.array([1.0, 0.25])
 """Variance of white noise in the values, and in their changes, over that in the values."""
 LEAST_SIGNAL = 0.3
-"""Part of a residual that is kept whatever the noise, so that of two in much noise none is far
-better than the other."""
+"""Share of a residual that is kept whatever the noise, so that of two in much noise
+none is far better than the other."""
 
 
 @dataclass(frozen=True, eq=False)
 class Reprojection:
-    """Images, and what a volume of them gives when it is projected again.
+    """Images, and the projections of a volume reconstructed from them.
 
     Attributes:
         images: (n, rows, cols) line integrals.
@@ -63,12 +63,14 @@ class Reprojection:
         return cls(images, scan.projected(values, cone_vec, shape, fine=False))
 
     def misfit(self, least: float = LEAST_SIGNAL) -> FloatArray:
-        """Root mean square of the residual over that of the images, beside the noise: of the
-        values, and of their changes along rows, which scatter and beam hardening hardly alter,
-        (2,).
+        """Compute the root mean square of the residual over that of the images, without
+        noise.
+
+        It is computed of the values, and of their changes along rows, which scatter and
+        beam hardening hardly alter, (2,).
 
         Args:
-            least: part of the residual that is kept whatever the noise.
+            least: share of the residual that is kept whatever the noise.
         """
         residual, signal, noise = self._powers
         beside = np.maximum(residual - noise, least * residual)
@@ -98,10 +100,10 @@ def _changes(images: Float32Array) -> Float32Array:
 
 
 def _noise_of(images: Float32Array) -> float:
-    """Variance of white noise in images, (n, rows, cols).
+    """Estimate the variance of white noise in images, (n, rows, cols).
 
-    From differences of neighbouring pixels, and of neighbouring views: of the two that in which an
-    object shows less.
+    It is computed from differences of neighbouring pixels and of neighbouring views,
+    whichever show less of the object.
     """
     if images.shape[1] > 1:
         mixed, terms = np.diff(np.diff(images, axis=2), axis=1), 4.0

@@ -25,23 +25,24 @@ from flexdt.twin.geometry.conventions import Float32Array
 NEIGHBOURHOOD_COLS: Final = 9
 """Columns over which a pixel is compared with its neighbours."""
 GROUP_VIEWS: Final = 6
-"""Views of which a median is taken first."""
+"""Views in a group, whose median is computed first."""
 MOST_GROUPS: Final = 48
-"""Groups that are kept; where there are more, each two neighbours become their mean."""
+"""Largest number of groups; beyond it, neighbouring groups are averaged in pairs."""
 FEWEST_GROUPS: Final = 6
-"""Groups whose distances tell the noise, at least."""
+"""Least number of groups from whose distances noise is estimated."""
 COLUMN_ROWS: Final = 15
-"""Rows over whose mean a column's error is found."""
+"""Rows over which a column's error is averaged."""
 BLOCK_PX: Final = 9
-"""Rows and columns over which variances are found."""
+"""Rows and columns over which variances are computed."""
 AXIS_REACH_PX: Final = 2
-"""How far from the stated axis the middle of what is alike on both sides is searched."""
+"""Largest distance from the stated axis at which the centre of symmetry is searched
+[px]."""
 MEDIAN_VARIANCE: Final = 1.571
 """Variance of a median over that of the mean of as many normal deviates."""
 SIGMA_OF_MEDIAN: Final = 1.4826
-"""Standard deviation of normal deviates over the median of their distances from the middle."""
+"""Standard deviation of normal deviates over the median of their absolute deviations."""
 SIGMAS: Final = 4.0
-"""By how many of its standard deviations a variance must exceed that of noise."""
+"""Least excess of a variance over that of noise, in its standard deviations."""
 
 
 def ring_errors(
@@ -77,7 +78,7 @@ def ring_errors(
 
 
 def _group_medians(views: Iterable[Float32Array], width: int) -> list[Float32Array]:
-    """Medians of what pixels lie beyond their neighbours by, over groups of views, (rows, cols)."""
+    """Compute medians of pixels' excess over neighbours in groups of views, (rows, cols)."""
     size = 2 * max(1, width // 2) + 1
     medians: list[Float32Array] = []
     group: list[Float32Array] = []
@@ -105,7 +106,9 @@ def _group_medians(views: Iterable[Float32Array], width: int) -> list[Float32Arr
 
 
 def _beyond_neighbours(view: Float32Array, size: int) -> Float32Array:
-    """Pixels less the mean of the others of `size` columns about them, (rows, cols)."""
+    """Subtract from pixels the mean of the others of `size` columns about them, (rows,
+    cols).
+    """
     from scipy.ndimage import uniform_filter1d
 
     mean = uniform_filter1d(view, size, axis=1, mode="nearest")
@@ -113,7 +116,7 @@ def _beyond_neighbours(view: Float32Array, size: int) -> Float32Array:
 
 
 def _column_means(image: Float32Array) -> Float32Array:
-    """Means over some rows about each pixel, (rows, cols)."""
+    """Average some rows about each pixel, (rows, cols)."""
     from scipy.ndimage import uniform_filter1d
 
     mean = uniform_filter1d(image, min(COLUMN_ROWS, len(image)), axis=0, mode="nearest")
@@ -122,7 +125,7 @@ def _column_means(image: Float32Array) -> Float32Array:
 
 @dataclass(frozen=True, eq=False)
 class _Pattern:
-    """What stays the same in all views.
+    """The part of images that is equal in all views.
 
     Attributes:
         values: (rows, cols).
@@ -134,17 +137,18 @@ class _Pattern:
 
     @classmethod
     def of(cls, groups: Float32Array) -> _Pattern:
-        """From groups of views, (k, rows, cols)."""
+        """Compute the pattern from groups of views, (k, rows, cols)."""
         middle = np.median(groups, axis=0)
         apart = SIGMA_OF_MEDIAN * np.median(np.abs(groups - middle), axis=0)
         noise = MEDIAN_VARIANCE / len(groups) * np.square(apart)
         return cls(middle, _block_mean(np.asarray(noise, np.float32)))
 
     def errors(self, ways: Sequence[Callable[[Float32Array], Float32Array]]) -> Float32Array:
-        """The pixels' part, (rows, cols).
+        """Compute the pixels' share of the pattern, (rows, cols).
 
         Args:
-            ways: of values (rows, cols) those of other pixels, to which an object adds the same.
+            ways: functions from values (rows, cols) to those of other pixels, to which an
+                object adds the same.
         """
         left = self.values
         power = _block_mean(np.square(left))
@@ -162,19 +166,19 @@ class _Pattern:
 
 
 def _rows_beside(values: Float32Array) -> Float32Array:
-    """Means of the pixels above and below, (rows, cols)."""
+    """Average the pixels above and below, (rows, cols)."""
     padded = np.pad(values, ((1, 1), (0, 0)), "reflect" if len(values) > 1 else "edge")
     return np.asarray(0.5 * (padded[:-2] + padded[2:]), np.float32)
 
 
 def _columns_seen_twice(cols: int, axis_column: float) -> npt.NDArray[np.bool_]:
-    """Columns that have one as far from the axis on the other side, (cols,)."""
+    """Find columns with a counterpart as far from the axis on the other side, (cols,)."""
     across = 2.0 * axis_column - np.arange(cols)
     return (across > -0.5) & (across < cols - 0.5)
 
 
 def _other_side(values: Float32Array, axis_column: float) -> Float32Array:
-    """The values of the columns as far from the axis on the other side, (rows, cols); 0 beyond the
+    """Return values of the columns as far from the axis on the other side, 0 off the
     panel.
     """
     stated = round(2.0 * axis_column)
@@ -185,7 +189,9 @@ def _other_side(values: Float32Array, axis_column: float) -> Float32Array:
 
 
 def _mirrored(values: Float32Array, total: int) -> Float32Array:
-    """Values with column c in the place of column `total` - c, 0 where there is none."""
+    """Return values with column c in the place of column `total` - c, 0 where there is
+    none.
+    """
     out = np.zeros_like(values)
     columns = np.arange(values.shape[1])
     there = (total - columns >= 0) & (total - columns < values.shape[1])

@@ -14,9 +14,10 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.reconstruction.coarse_scan import CoarseScan
 
 INTERLACED: Final = (2, 3, 4)
-"""Passes of interlaced scans that are tried."""
+"""Numbers of passes of interlaced scans that are tried."""
 CENTRED: Final = 0.25
-"""Distance of the axis from the middle of the panel that is none [coarse columns or rows]."""
+"""Largest distance of the axis from the panel's middle that counts as zero [coarse
+pixels]."""
 
 KINDS: Final = {
     "direction": "the rotation runs the other way",
@@ -32,12 +33,12 @@ KINDS: Final = {
     "height": "the panel's offset along the axis has the other sign",
     "offset": "the panel, or the axis, is moved:",
 }
-"""What is tried, and its words."""
+"""Kind of error -> its description."""
 
 
 @dataclass(frozen=True, eq=False)
 class Suspect:
-    """A scan as it would be if something were wrong with it.
+    """A scan as it would be with some error.
 
     Attributes:
         kind: of `KINDS`.
@@ -53,18 +54,18 @@ class Suspect:
 
 
 def reversed_turn(scan: CoarseScan) -> Suspect:
-    """The scan with the rotation the other way."""
+    """Make the scan with the rotation reversed."""
     turn = 2.0 * (scan.angles[0] - scan.angles)
     return Suspect("direction", scan.images, turned(scan, turn))
 
 
 def suspects(scan: CoarseScan, *, whole: bool) -> Iterator[Suspect]:
-    """All but the reversed rotation and other distances of the panel.
+    """Yield all suspects except the reversed rotation and other distances of the panel.
 
     Args:
         scan: coarse.
-        whole: the panel sees the object whole; where it does not, only panels on the wrong side and
-            mirrored images are suspected, which make an object seem cut off.
+        whole: the panel sees the complete object; if not, only panels on the wrong side
+            and mirrored images are suspected, which make an object seem cut off.
     """
     images, cone_vec = scan.images, scan.cone_vec
     aside, above = _axis_from_middle(scan)
@@ -84,7 +85,7 @@ def suspects(scan: CoarseScan, *, whole: bool) -> Iterator[Suspect]:
 
 
 def turned(scan: CoarseScan, turn: FloatArray) -> ConeVec:
-    """The views turned about the axis, each by its own angle (n,) [rad]."""
+    """Rotate the views about the axis, each by its own angle (n,) [rad]."""
     cos, sin, centre = np.cos(turn), np.sin(turn), np.append(scan.circle.centre, 0.0)
 
     def about(vectors: FloatArray) -> FloatArray:
@@ -97,13 +98,13 @@ def turned(scan: CoarseScan, turn: FloatArray) -> ConeVec:
 
 
 def moved(cone_vec: ConeVec, along: float, down: float = 0.0) -> ConeVec:
-    """Panels moved along their rows and down their columns [pixels]."""
+    """Move panels along their rows and down their columns [pixels]."""
     panel = cone_vec.detector + along * cone_vec.u + down * cone_vec.v
     return ConeVec.from_vectors(cone_vec.source, panel, cone_vec.u, cone_vec.v)
 
 
 def _orders(scan: CoarseScan) -> Iterator[Suspect]:
-    """Images that belong to other angles of the scan."""
+    """Yield scans whose images belong to other angles."""
     angle = scan.circle.angle
     count = len(angle)
     for kind, order, figure in _permutations(angle):
@@ -118,7 +119,9 @@ def _orders(scan: CoarseScan) -> Iterator[Suspect]:
 
 
 def _permutations(angle: FloatArray) -> Iterator[tuple[str, npt.NDArray[np.intp], str]]:
-    """Kinds of orders, and the view whose angle each image has, (n,)."""
+    """Yield kinds of orders, the view whose angle each image has, (n,), and a
+    description.
+    """
     count, listed = len(angle), np.arange(len(angle))
     steps = np.diff(np.unwrap(angle))
     if (steps > 0.0).all() or (steps < 0.0).all():
@@ -132,8 +135,10 @@ def _permutations(angle: FloatArray) -> Iterator[tuple[str, npt.NDArray[np.intp]
 
 
 def _axis_from_middle(scan: CoarseScan) -> tuple[float, float]:
-    """Where the source's foot on the axis falls from the middle of the panel, along rows and down
-    columns, over all views [coarse pixels].
+    """Compute where the source's foot on the axis falls, from the middle of the panel.
+
+    Returns:
+        offset along rows and down columns, over all views [coarse pixels].
     """
     shape = (scan.images.shape[1], scan.images.shape[2])
     x, y = scan.circle.centre

@@ -23,27 +23,30 @@ from flexdt.twin.reconstruction.feldkamp.image_upload import ImageUpload
 from flexdt.twin.reconstruction.feldkamp.noise import NoiseMeter
 
 MOST_COLUMNS: Final = 65_535
-"""Voxel columns along y that a device's grid can hold."""
+"""Largest number of voxel columns along y in a device's grid."""
 CHUNK: Final = 32
-"""Views worked on at a time, at least."""
+"""Least number of views in a chunk."""
 GROUP: Final = 8
-"""Views that the processor weighs and filters at a time, at least: they stay in its caches. Fewer
-of those that are widened to more than twice their columns, which take more memory."""
+"""Least number of views that the processor weighs and filters at a time: they stay in
+its caches. Fewer of those that are widened to more than twice their columns, which
+take more memory."""
 PIXELS: Final = 1 << 18
-"""Of a group; a chunk may hold four times as many. Calls of few rows cost more than their work."""
+"""Number of pixels of a group; a chunk may hold four times as many. Calls of few rows
+cost more than their work."""
 STACKS: Final = 6
-"""Stacks of so many images that a device holds: twice what came, and made wider, of three steps."""
+"""Stacks of so many images that a device holds: twice the input, and widened, of three
+steps."""
 
 
 def device_takes(like: Volume, shape: tuple[int, int]) -> bool:
-    """Whether there is a device that has room for the grid of `like` and images of (rows, cols)."""
+    """Return whether a device has room for the grid of `like` and images of (rows, cols)."""
     nz, ny, nx = like.shape
     need = 4 * (nz * ny * nx + STACKS * CHUNK * shape[0] * shape[1])
     return gpu.availability().present and ny <= MOST_COLUMNS and gpu.has_room(need)
 
 
 class OnProcessor:
-    """On the processor, all threads.
+    """Back-projector on the processor, on all threads.
 
     Attributes:
         meter: adds up the noise meanwhile; None for nothing.
@@ -78,12 +81,12 @@ class OnProcessor:
             self.meter.add(views, self._columns)
 
     def volume(self) -> Float32Array:
-        """What has been added up, (ny, nx, nz)."""
+        """Return the sum so far, (ny, nx, nz)."""
         return self._data
 
 
 def _weighed(views: Views) -> Float32Array:
-    """Rows that go into the filter, with their weights, (n, rows, cols)."""
+    """Compute weighted rows for the filter, (n, rows, cols)."""
     from flexdt.twin.reconstruction.kernels import fdk_kernels
 
     n, wide, _, rows = views.sizes
@@ -97,15 +100,17 @@ def _weighed(views: Views) -> Float32Array:
 
 
 class OnDevice:
-    """On a CUDA device, circles only: images go there, and the volume comes back.
+    """Back-projector on a CUDA device, for circles: images are sent, the volume comes
+    back.
 
-    Images are uploaded while the device works on earlier ones. Rows are continued, weighed and
-    filtered there two at a time, by a Fourier transform in the memory of a block; rows too long for
-    it are continued by the processor and convolved, a product for each pair of pixels.
+    Images are uploaded while the device works on earlier ones. Rows are continued,
+    weighed and filtered there two at a time, by a Fourier transform in the memory of a
+    block; rows too long for it are continued by the processor and convolved, a product
+    for each pair of pixels.
 
     Attributes:
-        meter: finds the noise from two more volumes on its coarse grid: of the views that count
-            with a plus there, and of those with a minus.
+        meter: finds the noise from two more volumes on its coarse grid: of the views that
+            count with a plus there, and of those with a minus.
 
     Raises:
         gpu.DeviceError: from each method; the device failed, and what was added is lost.
@@ -129,7 +134,7 @@ class OnDevice:
         gpu.demand(prepare)
 
     def add(self, views: Views) -> None:
-        """See `OnProcessor`."""
+        """Weigh and filter views, and add them to the volume; see `OnProcessor`."""
         signs = np.zeros(len(views.images), np.float32)
         if self.meter is not None:
             signs = self.meter.note(views)
@@ -138,13 +143,13 @@ class OnDevice:
         gpu.demand(lambda: self._add(views.without_images(order), order, *ends))
 
     def _add(self, views: Views, order: npt.NDArray[np.intp], plus: int, minus: int) -> None:
-        """Weigh, filter and add images, which are in the order that they came in.
+        """Weigh, filter and add images in the order of their arrival.
 
         Args:
-            views: what is known of them, in `order`.
+            views: their geometry, in `order`.
             order: number of the image of each.
-            plus: so many of the first count with a plus in the noise.
-            minus: those from this one on count with a minus.
+            plus: number of first views that count with a plus in the noise.
+            minus: first view of those that count with a minus.
         """
         self._upload.begin()
         length = padded_power(views)
@@ -164,7 +169,7 @@ class OnDevice:
                     )
 
     def _transformed(self, views: Views, order: npt.NDArray[np.intp], length: int) -> Any:
-        """Columns of the images on the device, weighed and filtered, (n, cols, rows)."""
+        """Weigh and filter columns of the images by a transform, (n, cols, rows)."""
         from flexdt.twin.reconstruction.kernels import gpu_reconstruction_kernels as kernels
 
         upload, on = self._upload, views.beyond
@@ -187,7 +192,9 @@ class OnDevice:
         return ready
 
     def _filter_tables(self, views: Views, length: int) -> tuple[Any, ...]:
-        """What all chunks share: how rows go on, the response, and the transform's factors."""
+        """Return the tables that all chunks share: continuation, response, transform's
+        factors.
+        """
         from numba import cuda
 
         on, turn = views.beyond, 2.0 * np.pi * np.arange(length // 2) / length
@@ -200,7 +207,7 @@ class OnDevice:
         )
 
     def _convolved(self, views: Views) -> Any:
-        """As `_transformed`, of rows of any length."""
+        """Weigh and filter by a sum over taps, for rows of any length; as `_transformed`."""
         from numba import cuda
 
         from flexdt.twin.reconstruction.kernels import gpu_reconstruction_kernels as kernels
@@ -230,7 +237,7 @@ class OnDevice:
         return ready
 
     def _ready(self, n: int, cols: int, rows: int) -> Any:
-        """Memory of the device for filtered columns, (n, cols, rows)."""
+        """Reserve device memory for filtered columns, (n, cols, rows)."""
         from numba import cuda
 
         if self._room is None or self._room.size < n * cols * rows:
@@ -259,7 +266,7 @@ class OnDevice:
         )
 
     def _both(self) -> list[tuple[Any, Any]]:
-        """The meter's grid with a volume for either sign, (grid, flat) each."""
+        """List the meter's grid with a volume for either sign, (grid, flat) each."""
         from numba import cuda
 
         if self.meter is not None and not self._halves:
@@ -269,7 +276,7 @@ class OnDevice:
         return self._halves
 
     def volume(self) -> Float32Array:
-        """See `OnProcessor`."""
+        """Return the sum so far, (ny, nx, nz); see `OnProcessor`."""
         from flexdt.twin.projection.kernels import layout_kernels
 
         out = np.empty(self._shape, np.float32)
@@ -296,7 +303,7 @@ def padded_power(views: Views) -> int:
 
 
 def bits_reversed(length: int) -> npt.NDArray[np.intp]:
-    """Numbers below a power of 2 with their bits in reversed order, (length,)."""
+    """List numbers below a power of 2 with their bits in reversed order, (length,)."""
     order = np.zeros(1, np.intp)
     while len(order) < length:
         order = np.concatenate([2 * order, 2 * order + 1])
@@ -304,4 +311,4 @@ def bits_reversed(length: int) -> npt.NDArray[np.intp]:
 
 
 Backprojector = OnProcessor | OnDevice
-"""What weighs and filters views and adds them to a volume."""
+"""Weighs and filters views and adds them to a volume."""

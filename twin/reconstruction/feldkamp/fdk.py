@@ -42,7 +42,7 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What is reconstructed, whatever the grid.
+    """A reconstruction, apart from its grid.
 
     Attributes:
         parts: gives float32 (k, rows, cols) arrays of line integrals, one image a view.
@@ -97,20 +97,20 @@ def fdk_parts(
     outside: bool = False,
     errors: bool = False,
 ) -> Volume:
-    """As `fdk`, with the views coming in parts, in order, and without warnings.
+    """Reconstruct as `fdk` from views that come in parts, in order, without warnings.
 
     Args:
-        parts: gives float32 (k, rows, cols) arrays of line integrals, together one image a view;
-            called once more where a device fails on the way, and for each slab of a volume that it
-            has no room for.
+        parts: gives float32 (k, rows, cols) arrays of line integrals, together one image
+            a view; called again if a device fails on the way, and for each slab of a
+            volume that it has no room for.
         cone_vec: of all views.
         shape: detector (rows, cols).
         like: the grid, or a volume on it.
         window: of the ramp filter.
         progress: called with the fraction done.
-        truncation: what lies beyond the panel's edges (`truncation_of`); None for nothing.
-        target: adds the views up, and may be looked at meanwhile; None for one of its own.
-        outside: of an object wider than the panel keep what the continued rows say of voxels that
+        truncation: object beyond the panel's edges (`truncation_of`); None for nothing.
+        target: adds the views up, and may be read meanwhile; None for a new one.
+        outside: keep the values that continued rows give to voxels of a wide object that
             are not seen from all sides, instead of NaN.
         errors: give the volume its `sigma` (of circles).
     """
@@ -167,7 +167,9 @@ def _add_all(
 
 
 def _slabs(like: Volume, shape: tuple[int, int]) -> list[tuple[int, int]]:
-    """Layers (first, last) of the slabs that a device has room for one by one; none without one."""
+    """List layers (first, last) of slabs that fit the device one by one; empty without a
+    device.
+    """
     count, most = 1, like.shape[0]
     while not device_takes(layers(like, 0, -(-most // count)), shape):
         if count >= most or not gpu.availability().present:
@@ -177,5 +179,5 @@ def _slabs(like: Volume, shape: tuple[int, int]) -> list[tuple[int, int]]:
 
 
 def _share(progress: Progress | None, k: int, count: int) -> Progress | None:
-    """What to tell of the k-th of several equal parts."""
+    """Map progress of the k-th of several equal parts to progress of all."""
     return None if progress is None else lambda part: progress((k + part) / count)

@@ -42,10 +42,11 @@ from flexdt.twin.reconstruction.feldkamp.fdk_views import Views, view_table
 from flexdt.twin.reconstruction.feldkamp.filtering import ramp
 
 FEW_ROWS: Final = 5
-"""Of a panel that is done voxels beside one another at a time. The panel decides, not the rows that
-a grid needs: slabs are the whole volume's to the bit."""
+"""Rows of a panel for which voxels side by side are computed at a time. The panel
+decides, not the rows that a grid needs: slabs equal the complete volume to the bit."""
 MOST_ASIDE: Final = 0.1
-"""By how much of its width the panel may go sideways between the views: jitter, not tiles."""
+"""Largest sideways movement of the panel between views, over its width: jitter, not
+tiles."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,10 +70,11 @@ class Panels:
 
 @dataclass(frozen=True)
 class Widths:
-    """Rows and columns of the upright panel that are worked on, counted from its first.
+    """Rows and columns of the upright panel that are computed, counted from its first.
 
     Attributes:
-        first, last: rows in the grid's shadow, first <= r < last; they may lie off the panel.
+        first, last: rows in the grid's shadow, first <= r < last; they may lie off the
+            panel.
         before, after: columns off the panel that go into the filter.
         near: columns off the panel on either side whose filtered values are needed.
         cols: of the panel.
@@ -87,12 +89,12 @@ class Widths:
 
     @property
     def rows(self) -> int:
-        """Rows that are needed."""
+        """Number of rows needed."""
         return self.last - self.first
 
     @property
     def wide(self) -> int:
-        """Columns that go into the filter."""
+        """Number of columns that go into the filter."""
         return self.before + self.cols + self.after
 
     @property
@@ -107,7 +109,7 @@ class Widths:
 
     @property
     def reach(self) -> int:
-        """Largest distance between a column that is needed and one that acts on it, and 1."""
+        """Largest distance between a needed column and one that acts on it, plus 1."""
         return self.wide - min(self.before - self.near[0], self.after - self.near[1])
 
 
@@ -141,7 +143,7 @@ class FdkPlan:
 
     @property
     def count(self) -> int:
-        """Views of the scan."""
+        """Number of views of the scan."""
         return len(self.level)
 
     def views_of(self, part: Float32Array, done: int) -> Views:
@@ -244,10 +246,10 @@ def plan_fdk(
 
 
 def _panels(circle: Circle, cone_vec: ConeVec, shape: tuple[int, int]) -> Panels:
-    """Stand the panels of a scan upright, with the axis on a column or between two if needed.
+    """Make the panels upright, with the axis on a column or between two if needed.
 
     Raises:
-        GeometryError: rows of one pixel, a panel that lies flat, or one that goes sideways.
+        GeometryError: rows of one pixel, a horizontal panel, or one that moves sideways.
     """
     turned = on_its_side(cone_vec)
     if turned:

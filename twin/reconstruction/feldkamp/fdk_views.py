@@ -14,10 +14,10 @@ from flexdt.twin.reconstruction.acquisition.truncation import Continuation
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Some views on their way to a volume.
+    """A group of views with their geometry, images and weights.
 
-    They are widened, multiplied by factors / length of the ray to the pixel, and filtered along
-    rows.
+    They are widened, multiplied by factors / length of the ray to the pixel, and filtered
+    along rows.
 
     Attributes:
         images: (n, rows of the panel, its cols).
@@ -25,8 +25,8 @@ class Views:
         before: columns that go into the filter before the panel's first.
         beyond: how rows go on there and behind the panel's last column.
         factors: float64 (n, cols that go into the filter).
-        across, up: squares of the ray's horizontal and vertical parts, (n, cols) and (n, rows that
-            are needed) [mm^2].
+        across, up: squares of the ray's horizontal and vertical parts, (n, cols) and (n,
+            rows that are needed) [mm^2].
         response: of the filter.
         kept: columns whose filtered values are needed.
         shares, table: of `fdk_kernels.backproject`.
@@ -48,28 +48,28 @@ class Views:
 
     @property
     def sizes(self) -> tuple[int, int, int, int]:
-        """Views, columns before and after the filter, rows."""
+        """Number of views, of columns before and after the filter, and of rows."""
         n, wide = self.factors.shape
         return n, wide, self.kept.stop - self.kept.start, self.up.shape[1]
 
     @property
     def wider(self) -> bool:
-        """Whether columns off the panel go into the filter."""
+        """True if columns off the panel go into the filter."""
         return bool(self.factors.shape[1] > self.images.shape[2])
 
     @property
     def shown(self) -> slice:
-        """The panel's rows that are needed, or that rows off the panel repeat."""
+        """Rows of the panel that are needed, or that rows off the panel repeat."""
         count = self.images.shape[1]
         first = min(max(self.top, 0), count - 1)
         return slice(first, min(max(self.top + self.up.shape[1], first + 1), count))
 
     def of(self, which: slice | npt.NDArray[np.intp]) -> Views:
-        """Some of these views."""
+        """Select some of these views."""
         return replace(self.without_images(which), images=self.images[which])
 
     def without_images(self, which: slice | npt.NDArray[np.intp]) -> Views:
-        """What is known of some of these views, beside the images of all."""
+        """Select some of these views, with the images of all."""
         return replace(
             self, beyond=self.beyond.of(which),
             factors=self.factors[which], across=self.across[which], up=self.up[which],

@@ -38,7 +38,7 @@ def ramp(reach: int, pitch_mm: float, window: str = PLAIN) -> Float32Array:
 
 
 def _even_length(least: int) -> int:
-    """The first even length from `least` on whose transform is fast."""
+    """Find the first even length from `least` on whose transform is fast."""
     from scipy import fft
 
     length = int(fft.next_fast_len(least, real=True))
@@ -48,14 +48,14 @@ def _even_length(least: int) -> int:
 
 
 def padded_length(response: Float32Array) -> int:
-    """Columns of a padded row, of the filter's response."""
+    """Compute the columns of a padded row from the filter's response."""
     return 2 * (len(response) - 1)
 
 
 def filtered(rows: Float32Array, response: Float32Array) -> Float32Array:
     """Convolve rows (..., cols), zero beyond their ends, with the filter of `response`.
 
-    Columns are right as far as `ramp` was told that they act on each other.
+    Columns are right within the reach that `ramp` was given.
     """
     from scipy import fft
 

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 PORTION_BYTES: Final = 24 * 2**20
-"""Page-locked memory of each of the two portions, at least one image."""
+"""Page-locked memory of each of the two portions [bytes], at least one image."""
 
 
 class ImageUpload:
@@ -46,8 +46,8 @@ class ImageUpload:
 
         Args:
             images: (n, rows, cols).
-            order: number of the image that goes to each place, (n,).
-            rows: that are uploaded.
+            order: number of the image for each place, (n,).
+            rows: rows to upload.
         """
         from flexdt.twin.reconstruction.kernels import fdk_kernels
 
@@ -88,7 +88,7 @@ class ImageUpload:
         self._read[self._chunk] = done
 
     def _room(self, name: str, count: int) -> Any:
-        """Memory of the device for one array of this chunk, (count,)."""
+        """Return device memory for one array of this chunk, (count,)."""
         from numba import cuda
 
         pair = self._rooms.setdefault(name, [None, None])
@@ -97,7 +97,7 @@ class ImageUpload:
         return pair[self._chunk][:count]
 
     def _portion(self, count: int) -> Any:
-        """Page-locked memory that the device has fetched everything from, (count,)."""
+        """Return page-locked memory, (count,), once the device has fetched its content."""
         from numba import cuda
 
         self._turn = 1 - self._turn

@@ -25,18 +25,19 @@ from flexdt.twin.reconstruction.feldkamp.slabs import layers
 from flexdt.twin.reconstruction.volume_errors import interpolated
 
 NODES: Final = 32
-"""Nodes of the coarse grid along the longest side, at most: noise changes smoothly."""
+"""Largest number of nodes of the coarse grid along a side: noise changes smoothly."""
 APART: Final = 3
-"""Rows of the panel, at least, between two that are compared: blur ties neighbours together."""
+"""Least distance of two compared rows of the panel: blur correlates neighbours."""
 BANDS: Final = 16
-"""Bands of the spectrum, over which it is averaged."""
+"""Bands of the spectrum over which it is averaged."""
 AROUND: Final = 8
 POINTS: Final = 32 * AROUND
-"""Places at which the variance of what all views share is computed, and how many are averaged."""
+"""Places at which the variance common to all views is computed, and how many are
+averaged."""
 SIDE: Final = 5
 """Side of the window about a node whose values are compared [nodes]."""
 MEDIAN: Final = 0.67449
-"""Median of the sizes of normal deviates."""
+"""Median of the absolute values of standard normal deviates."""
 TINY: Final = float(np.finfo(np.float32).tiny)
 
 
@@ -57,7 +58,7 @@ class Noise:
     shared: FloatArray
 
     def sigma(self, grid: Volume) -> Float32Array:
-        """Standard deviation at each voxel of a grid, (nz, ny, nx) [1/mm]."""
+        """Compute the standard deviation at each voxel of a grid, (nz, ny, nx) [1/mm]."""
         x, y, _ = grid.centers()
         flat = np.hypot(x - self.centre[0], (y - self.centre[1])[:, None])
         out = interpolated(self.views, grid)
@@ -78,13 +79,13 @@ class NoiseOfSlabs:
     noises: tuple[Noise, ...]
 
     def sigma(self, grid: Volume) -> Float32Array:
-        """See `Noise`; of the whole grid."""
+        """Compute the standard deviation on the complete grid; see `Noise`."""
         parts = zip(self.slabs, self.noises, strict=True)
         return np.concatenate([noise.sigma(layers(grid, *slab)) for slab, noise in parts])
 
 
 class NoiseMeter:
-    """Adds up, beside a volume, what its noise is found from.
+    """Collects the data for the noise of a volume while views are added to it.
 
     Args:
         like: the volume's grid.
@@ -118,7 +119,9 @@ class NoiseMeter:
         self._response: FloatArray = np.zeros(0)
 
     def note(self, views: Views) -> Float32Array:
-        """Note what views show and where; returns the sign of each in the alternating sum, (n,)."""
+        """Record values and positions of views; returns each one's sign in the
+        alternating sum, (n,).
+        """
         from flexdt.twin.reconstruction.kernels import fdk_kernels
 
         n = len(views.images)
@@ -145,7 +148,9 @@ class NoiseMeter:
         )
 
     def _points(self) -> tuple[FloatArray, FloatArray]:
-        """Places on a spiral about the centre, radii (POINTS,) and (POINTS, 2) [mm]."""
+        """Place points on a spiral about the centre: radii (POINTS,) and (POINTS, 2)
+        [mm].
+        """
         x, y, _ = self.grid.centers()
         farthest = float(np.hypot(*(np.abs([x[[0, -1]], y[[0, -1]]]).max(axis=1))))
         pitch = self._circle.radius / float(self._table[:, 7].mean())
@@ -155,7 +160,9 @@ class NoiseMeter:
         return radii, radii[:, None] * around + self._circle.centre
 
     def _seen_at(self, views: Views) -> tuple[FloatArray, FloatArray]:
-        """In which column, before the filter, views see the points, and what it counts there."""
+        """Compute the column, before the filter, at which views see the points, and its
+        weight.
+        """
         points = self._points()[1]
         g = views.table[:, :, None]
         x, y = points[:, 0] - g[:, 0], points[:, 1] - g[:, 1]
@@ -167,7 +174,7 @@ class NoiseMeter:
         return np.where(inside, column, 0.0), np.where(inside, factors / depth**2, 0.0)
 
     def found(self) -> Noise | None:
-        """The noise, once all views have been added; None where too few rows see the grid."""
+        """Compute the noise after all views; None if too few rows see the grid."""
         assert self._means is not None
         if self._means.shape[1] <= APART + 1 or np.isnan(self.data).all():
             return None
@@ -183,7 +190,7 @@ class NoiseMeter:
         return Noise(self.grid.like(variance), centre, radii, shared)
 
     def _shared_variance(self) -> FloatArray:
-        """Variance at the points of what all views share, (points,) [1/mm^2]."""
+        """Compute the variance at the points common to all views, (points,) [1/mm^2]."""
         assert self._means is not None
         length = 2 * (len(self._response) - 1)
         column = np.concatenate([columns for columns, _ in self._hits])
@@ -204,8 +211,9 @@ class NoiseMeter:
 
 
 def _local_variance(values: Float32Array) -> Float32Array:
-    """Variance of values of zero mean about each of them, from the median of their sizes, which few
-    strong edges do not change; (nz, ny, nx).
+    """Compute the variance of zero-mean values about each of them, (nz, ny, nx).
+
+    It is computed from the median of their sizes, which few strong edges do not change.
     """
     from scipy.ndimage import distance_transform_edt, gaussian_filter, median_filter
 
@@ -219,11 +227,11 @@ def _local_variance(values: Float32Array) -> Float32Array:
 
 
 def _spectrum(image: Float32Array, length: int) -> FloatArray:
-    """Power of an image's noise along its rows, of a length of `length`, where the volume's voxels
-    lie anywhere between two rows, (length / 2 + 1,).
+    """Compute the power of an image's noise along its rows, (length / 2 + 1,).
 
-    Rows a few apart are compared, so that the object drops out but for its edges, which the median
-    over all pairs of rows does not see.
+    The volume's voxels may be anywhere between two rows. Rows a few apart are compared,
+    so that only the object's edges remain, which the median over all pairs of rows
+    ignores.
     """
     between = 0.5 * (image[1:] + image[:-1])
     power = [

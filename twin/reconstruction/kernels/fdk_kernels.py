@@ -29,7 +29,9 @@ from flexdt.twin.projection.volume import aligned_zeros
 
 
 def lanes() -> int:
-    """Voxels to a register of the processor that numba compiles for: 16, 8 or 1."""
+    """Return the voxels in a register of the processor that numba compiles for: 16, 8 or
+    1.
+    """
     asked = config.CPU_FEATURES
     features = (get_host_cpu_features() if asked is None else asked).split(",")
     if "+fma" not in features:
@@ -39,11 +41,11 @@ def lanes() -> int:
 
 LANES = lanes()
 STEEPEST = 1.9
-"""Largest step [samples a voxel] for which LANES voxels lie within 2 LANES samples."""
+"""Largest step [samples a voxel] for which LANES voxels are within 2 LANES samples."""
 MARGIN = 32
 """Samples after the end of a line that may be read or written, but do not count."""
 POINT = 44
-"""Bits behind the point of a place on a line."""
+"""Bits behind the point of a position on a line."""
 
 _FLOATS = ir.VectorType(ir.FloatType(), LANES)
 _INTS = ir.VectorType(ir.IntType(32), LANES)
@@ -71,7 +73,7 @@ def _pick(builder: Any, low: Any, high: Any, index: Any) -> Any:
 
 
 def _at(context: Any, builder: Any, signature: Any, args: Any, array: int, index: Any) -> Any:
-    """Where LANES values of the argument number `array` begin."""
+    """Compute the address of LANES values in the argument number `array`."""
     data = context.make_array(signature.args[array])(context, builder, args[array]).data
     return builder.bitcast(builder.gep(data, [index]), _FLOATS.as_pointer())
 
@@ -92,7 +94,10 @@ def _fma(builder: Any, *args: Any) -> Any:
 def mix_lanes(
     typingctx: Any, out: Any, r: Any, left: Any, right: Any, at: Any, one: Any, other: Any
 ) -> Any:
-    """out[r + i] = one * left[at + i] + other * right[at + i], 0 <= i < LANES; not for 1 lane."""
+    """Compute out[r + i] = one * left[at + i] + other * right[at + i], 0 <= i < LANES.
+
+    Not for 1 lane.
+    """
 
     def codegen(context: Any, b: Any, signature: Any, args: Any) -> Any:
         left = _load(b, _at(context, b, signature, args, 2, args[4]))
@@ -106,9 +111,10 @@ def mix_lanes(
 
 @intrinsic
 def resample_lanes(typingctx: Any, acc: Any, k: Any, line: Any, at: Any, v: Any, step: Any) -> Any:
-    """acc[k + i] += line at (at + v / 2^POINT + i step), linear, 0 <= i < LANES; not for 1 lane.
+    """Add line at (at + v / 2^POINT + i step), linear, to acc[k + i], 0 <= i < LANES.
 
-    Needs 0 <= v / 2^POINT + i step < 2 LANES - 1; reads line[at : at + 2 LANES].
+    Not for 1 lane. Needs 0 <= v / 2^POINT + i step < 2 LANES - 1; reads line[at : at + 2
+    LANES].
     """
 
     def codegen(context: Any, b: Any, signature: Any, args: Any) -> Any:
@@ -137,21 +143,25 @@ def resample_lanes(typingctx: Any, acc: Any, k: Any, line: Any, at: Any, v: Any,
 
 @fused
 def mix_one_by_one(out, left, right, first, count, one, other):
-    """out[r] = one * left[first + r] + other * right[first + r], 0 <= r < count."""
+    """Compute out[r] = one * left[first + r] + other * right[first + r], 0 <= r < count."""
     for r in range(count):
         out[r] = one * left[first + r] + other * right[first + r]
 
 
 @kernel
 def mix_wide(out, left, right, first, count, one, other):
-    """`mix_one_by_one`, LANES at a time; all need up to LANES - 1 values after their end."""
+    """Apply `mix_one_by_one` to LANES at a time; all need up to LANES - 1 values after
+    their end.
+    """
     for r in range(0, count, LANES):
         mix_lanes(out, r, left, right, first + r, one, other)
 
 
 @kernel
 def add_line(acc, line, first, count, start, step):
-    """acc[first + k] += line at (start + k step), linear; 0 <= k < count, all inside."""
+    """Add line at (start + k step), linear, to acc[first + k], 0 <= k < count, all
+    inside.
+    """
     for k in range(count):
         at = start + k * step
         i = np.uint64(at)
@@ -161,7 +171,9 @@ def add_line(acc, line, first, count, start, step):
 
 @kernel
 def add_line_wide(acc, line, first, count, start, step):
-    """`add_line`, LANES at a time while that fits; line needs MARGIN samples after its end."""
+    """Apply `add_line` to LANES at a time while that fits; needs MARGIN samples after the
+    end.
+    """
     k = np.int64(0)
     if abs(step) < STEEPEST:
         narrow = np.float32(step)
@@ -189,20 +201,23 @@ mix_columns = mix_one_by_one if LANES == 1 else mix_wide
 
 TILE = 8
 WIDE = 64
-"""Voxels beside one another that are done at a time for few rows."""
+"""Neighbouring voxels that are computed at a time for few rows."""
 
 
 @fused
 def _times(line, left, right, part):
-    """line *= left + part * (right - left)."""
+    """Compute line *= left + part * (right - left)."""
     for r in range(line.size):
         line[r] *= left[r] + part * (right[r] - left[r])
 
 
 @inline
 def _column(g, cols, x, y):
-    """Where a view sees all voxels above one another at (x, y): their depth along the panel's
-    normal [mm], 0 where it does not see them, and the column.
+    """Find the column in which a view sees all voxels above one another at (x, y).
+
+    Returns:
+        depth along the panel's normal [mm], 0 if the view does not see them, and the
+            column.
     """
     x -= g[0]
     y -= g[1]
@@ -257,8 +272,10 @@ def _add_view(acc, image, rows, shares, g, x, y, z0, dz, line):
 
 @fused
 def _places(at, across, down, weight, size, base, zero, depth, slope, c, turn, row, rise):
-    """Where a view sees voxels beside one another: the sample before, how far on across and down it
-    is, and the weight, 0 for voxels that it does not see. Numbers that differ little are float32.
+    """Compute where a view sees neighbouring voxels.
+
+    Fills the sample before (at), the fractions across and down, and the weight, 0 for
+    voxels that it does not see. Numbers that differ little are float32.
 
     size, base: columns and rows of the image; the column to which `c` is relative.
     zero: the voxel of which `depth`, `c` and `row` are.
@@ -287,7 +304,7 @@ def _places(at, across, down, weight, size, base, zero, depth, slope, c, turn, r
 
 @fused
 def _add_places(acc, image, rows, at, across, down, weight):
-    """acc += weight * what a view shows at places; image: (cols * rows,)."""
+    """Add weight * the view's values at places to acc; image: (cols * rows,)."""
     rows = np.uint64(rows)
     for k in range(at.size):
         i = np.uint64(at[k])
@@ -416,15 +433,16 @@ def _cover(g, weights, rows, on_panel, radius, x, y, z0, dz, seen):
 def normalise_coverage(
     views, weights, rows, on_panel, radius, x0, y0, z0, dx, dy, dz, least, half_turn, volume
 ):
-    """Divide each voxel by the part of the views' weight that saw it.
+    """Divide each voxel by the share of the views' weight that saw it.
 
-    In the other views it lies above or below the panel. Voxels of which that part is less than
-    `least` become NaN, as do those that are not seen along lines of all directions (`half_turn`).
+    In the other views it is above or below the panel. Voxels whose share is less than
+    `least` become NaN, as do those that are not seen along lines of all directions
+    (`half_turn`).
 
     views: float64 (n, 11) and weights: float64 (n, cols), of `backproject`.
     on_panel: first and last column of the panel.
     radius: from the axis to the source [mm].
-    half_turn: pi, or nearly so [rad]; 0 where nothing lies beside the panel.
+    half_turn: pi, or nearly so [rad]; 0 where nothing is beside the panel.
     volume: float32 (ny, nx, nz).
     """
     ny, nx, nz = volume.shape
@@ -451,20 +469,26 @@ def normalise_coverage(
 
 
 def room(n: int, cols: int, rows: int, few: bool) -> Float32Array:
-    """Memory for images, (n, cols, rows and more): columns of whole registers, aligned to them; of
-    panels of few rows no more, by which the kernel knows them."""
+    """Allocate memory for images, (n, cols, rows and more), in aligned columns of full
+    registers.
+
+    Panels of few rows get no more rows, by which the kernel recognises them.
+    """
     shape = (n, cols, rows if few else (rows // LANES + 1) * LANES)
     return aligned_zeros(math.prod(shape)).reshape(shape)
 
 
 @parallel
 def weigh(images, first, factors, across, up, out):
-    """out[n, r, c] = images[n, first + r, c] * factors[n, c] / length of the ray to (r, c).
+    """Compute out[n, r, c] = images[n, first + r, c] * factors[n, c] / length of the ray
+    to (r, c).
 
-    images: float32 (n, rows of the panel, cols); rows beyond the panel repeat its outermost ones.
+    images: float32 (n, rows of the panel, cols); rows beyond the panel repeat its
+    outermost ones.
     out: float32 (n, rows, cols).
     factors: float64 (n, cols).
-    across, up: squares of the ray's horizontal and vertical parts, (n, cols) and (n, rows) [mm^2].
+    across, up: squares of the ray's horizontal and vertical parts, (n, cols) and (n,
+    rows) [mm^2].
     """
     n, rows, cols = out.shape
     for job in prange(n * rows):
@@ -501,7 +525,7 @@ def add_views(images, first, signs, sums):
 
 @parallel
 def copy_rows(images, order, first, out):
-    """out[n, r, c] = images[order[n], first + r, c], float32, on all cores."""
+    """Copy out[n, r, c] = images[order[n], first + r, c], float32, on all cores."""
     n, rows, _ = out.shape
     for job in prange(n * rows):
         out[job // rows, job % rows] = images[order[job // rows], first + job % rows]
@@ -509,7 +533,9 @@ def copy_rows(images, order, first, out):
 
 @parallel
 def respond(spectra, response):
-    """spectra *= response: float32 (n, frequencies, 2), real and imaginary part, (frequencies,)."""
+    """Multiply spectra, float32 (n, frequencies, 2), real and imaginary, by response
+    (frequencies,).
+    """
     for k in prange(len(spectra)):
         for f in range(response.size):
             spectra[k, f, 0] *= response[f]
@@ -521,7 +547,9 @@ BLOCK = 32
 
 @parallel
 def stand_up(rows_first, start, out):
-    """out[n, c, r] = rows_first[n, r, start + c], in blocks, so that both stay in the cache."""
+    """Transpose out[n, c, r] = rows_first[n, r, start + c], in blocks that stay in the
+    cache.
+    """
     n, cols = out.shape[:2]
     rows = rows_first.shape[1]
     blocks = (cols + BLOCK - 1) // BLOCK
@@ -536,11 +564,13 @@ def stand_up(rows_first, start, out):
 
 TAPS = 6
 PARTS = 1024
-"""Places between two samples for which weights are at hand."""
+"""Number of tabulated places between two samples."""
 
 
 def lanczos() -> Float32Array:
-    """Weights of six samples at -2 to 3 for points at 0, 1 / PARTS ... 1: three lobes, sum 1."""
+    """Compute weights of six samples at -2 to 3 for points at 0, 1 / PARTS ... 1: three
+    lobes, sum 1.
+    """
     x = np.arange(PARTS + 1)[:, None] / PARTS - np.arange(-2, 4)
     weights = np.sinc(x) * np.sinc(x / 3.0)
     return np.asarray(weights / weights.sum(axis=1, keepdims=True), dtype=np.float32)
@@ -548,10 +578,11 @@ def lanczos() -> Float32Array:
 
 @parallel
 def warp(images, maps, weights, out):
-    """out[n, r, c] = images[n] at maps[n] @ (c, r, 1); edges go on as their last pixel.
+    """Sample out[n, r, c] = images[n] at maps[n] @ (c, r, 1); edges repeat their last
+    pixel.
 
-    `weights` are those of `lanczos`: with three lobes what is sharp in a tilted image stays sharper
-    than by cubic interpolation, which took contrast from the finest details.
+    `weights` are those of `lanczos`: with three lobes sharp details in a tilted image
+    stay sharper than by cubic interpolation, which took contrast from the finest ones.
     """
     n, rows, wide = out.shape
     cols = images.shape[2]

@@ -21,16 +21,17 @@ from numba import config, cuda
 BLOCK = (32, 4)
 """Threads a block: along z, and voxel columns along x; each is one warp."""
 RUN = 8
-"""Voxels a thread, BLOCK[0] apart along z; columns a thread of the filter."""
+"""Voxels of a thread, BLOCK[0] apart along z; columns of a thread of the filter."""
 PLANE = (32, 8)
 """Threads a block of `weigh` and `convolve`: rows, and columns, of which eight are one sector of
 memory in an image whose columns are neighbours."""
 BITS = 32
-"""Of a row's number, behind the point."""
+"""Bits of a row's number behind the point."""
 FIXED = float(2**BITS)
 UNIT = np.float32(1.0 / FIXED)
 STEEP = float(2**30)
-"""Rows from voxel to voxel, at most; where there are more, one voxel at most is on the panel."""
+"""Largest number of rows from voxel to voxel; beyond it, at most one voxel is on the
+panel."""
 
 if config.ENABLE_CUDASIM:
 
@@ -46,7 +47,8 @@ else:
 
 @cuda.jit
 def weigh(images, top, factors, across, up, out):
-    """out[n, c, r] = images[n, top + r, c] * factors[n, c] / sqrt(across[n, c] + up[n, r]).
+    """Compute out[n, c, r] = images[n, top + r, c] * factors[n, c] / sqrt(across[n, c] +
+    up[n, r]).
 
     All are float32; images (n, rows of the panel, cols), out (n, cols, rows); see
     `fdk_kernels.weigh`.
@@ -61,10 +63,11 @@ def weigh(images, top, factors, across, up, out):
 
 @cuda.jit
 def convolve(weighted, taps, start, out):
-    """out[n, c, r] = sum over j of weighted[n, j, r] * taps[|start + c - j|].
+    """Convolve rows with taps.
 
-    A thread finds RUN neighbouring columns: from one j to the next the taps move on by one place,
-    so that two numbers are read for RUN products.
+    out[n, c, r] = sum over j of weighted[n, j, r] * taps[|start + c - j|]. A thread
+    computes RUN neighbouring columns: from one j to the next the taps move on by one
+    place, so that two numbers are read for RUN products.
 
     weighted: float32 (n, wide, rows), rows contiguous; out: (n, cols, rows).
     taps: float32 (wide + RUN,) at least.
@@ -93,16 +96,17 @@ def convolve(weighted, taps, start, out):
 
 
 LENGTH = 4096
-"""Columns of a padded row, at most: two rows of so many have room in a block's shared memory."""
+"""Largest number of columns of a padded row: two such rows fit into a block's shared
+memory."""
 THREADS = 256
-"""Threads a block of `filter_rows`, which takes two rows."""
+"""Threads in a block of `filter_rows`, which filters two rows."""
 SIDES = 128
-"""Partial sums over the two edges of two rows: 32 of each."""
+"""Number of partial sums over the two edges of two rows: 32 of each."""
 
 
 @cuda.jit(device=True, inline=True)
 def prism_path(lengths, view, low, share, slant, c):
-    """Path length times attenuation, of a ray `slant` times as long as its horizontal part."""
+    """Compute path length times attenuation, of a ray `slant` times its horizontal part."""
     high = min(low + 1, lengths.shape[1] - 1)
     lower = lengths[view, low, c]
     return (lower + share * (lengths[view, high, c] - lower)) * slant
@@ -110,7 +114,9 @@ def prism_path(lengths, view, low, share, slant, c):
 
 @cuda.jit(device=True, inline=True)
 def edge_sum(images, top, lengths, band, share, across, up, before, edge, view, r, side, part):
-    """A 32nd of the sum, over an edge's columns, of a row less the prisms' path lengths."""
+    """Compute a 32nd of the sum, over an edge's columns, of a row less the prisms' path
+    lengths.
+    """
     row = min(max(top + r, 0), images.shape[1] - 1)
     first = images.shape[2] - edge if side else 0
     total = np.float32(0)
@@ -125,9 +131,10 @@ def edge_sum(images, top, lengths, band, share, across, up, before, edge, view, 
 def weighted_pixel(
     images, top, factors, across, up, lengths, band, share, fade, before, rests, view, r, c, which
 ):
-    """A column of a widened row with FDK's weight; see `fdk_kernels.weigh` and `continue_rows`.
+    """Compute a pixel of a widened row with FDK's weight; see `fdk_kernels.weigh`.
 
-    rests: what prisms leave at the low (2 `which`) and the high edge (2 `which` + 1) of the row.
+    rests: what prisms leave at the low (2 `which`) and the high edge (2 `which` + 1) of
+    the row.
     """
     slant = math.sqrt(across[view, c] + up[view, r])
     if c < before or c >= before + images.shape[2]:
@@ -332,7 +339,7 @@ def differences(x, i, k, column, counts, stride, scale):
 
 @cuda.jit
 def lengths(x, counts, stride, scale, out):
-    """out = the length of each voxel's differences, of which the sum is the total variation."""
+    """Compute the length of each voxel's differences, whose sum is the total variation."""
     i = cuda.grid(1)
     if i < x.size:
         k, column = i % stride, i // stride
@@ -344,7 +351,9 @@ def lengths(x, counts, stride, scale, out):
 
 @cuda.jit
 def primal_step(z, dual, theta, counts, stride, scale, lowest, allowed, x):
-    """x = the allowed values next to z - theta D' dual, with the differences' transpose D'."""
+    """Compute x, the allowed values next to z - theta D' dual, D' the transposed
+    differences.
+    """
     i = cuda.grid(1)
     if i >= z.size:
         return
@@ -365,8 +374,10 @@ def primal_step(z, dual, theta, counts, stride, scale, lowest, allowed, x):
 
 @cuda.jit
 def dual_step(x, ahead, dual, rate, momentum, counts, stride, scale):
-    """dual = ahead + rate D x, shortened to length 1 voxel by voxel; then ahead = dual + momentum
-    times what dual has changed.
+    """Compute dual = ahead + rate D x, shortened to length 1 a voxel, and extrapolate
+    ahead.
+
+    ahead = dual + momentum times the change of dual.
     """
     i = cuda.grid(1)
     if i >= x.size or i % stride >= counts[0]:

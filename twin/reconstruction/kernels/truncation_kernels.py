@@ -19,20 +19,22 @@ from flexdt.twin.projection.kernels.compiling import kernel, parallel, serial
 
 PARAMETERS = 6
 MOST_STEPS = 100
-"""Evaluations of a fit, at most: usually a dozen is enough."""
+"""Largest number of evaluations of a fit: usually a dozen is enough."""
 GAIN = 1e-10
-"""Relative fall of the cost below which a fit has come to its end."""
+"""Relative fall of the cost below which a fit ends."""
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1.0, 1e-9, 1e9
 RIM = 1e-3
-"""Part of the longest chord, squared, below which its slope is taken as there: at the rim itself it
-is infinite."""
+"""Share of the longest chord, squared, below which its slope is limited: at the rim
+itself it is infinite."""
 
 
 @kernel
 def _chord(prism, source_x, source_y, x, y):
-    """Path length times attenuation through a prism, over the horizontal length of the ray (x, y).
+    """Compute path length times attenuation through a prism, over the ray's horizontal
+    length.
 
-    prism: centre x, y; lower triangle (0, 0), (1, 0), (1, 1) to the unit disc; attenuation.
+    The ray has the direction (x, y). prism: centre x, y; lower triangle (0, 0), (1, 0),
+    (1, 1) to the unit disc; attenuation.
     """
     start_x = source_x - prism[0]
     start_y = source_y - prism[1]
@@ -48,7 +50,8 @@ def _chord(prism, source_x, source_y, x, y):
 
 @kernel
 def _edge_mean(line, before, first, last, lower, upper, share, across, high):
-    """Mean of a row less the prisms' path lengths, over columns first <= c < last of the panel.
+    """Average a row less the prisms' path lengths over columns first <= c < last of the
+    panel.
 
     line: the panel's row; before: columns before it among the widened ones.
     """
@@ -95,17 +98,19 @@ def prism_lengths(before, cols, edge, plane, prisms, out):
 
 @parallel
 def continue_rows(images, first, before, edge, lengths, band, share, cut, fade, across, up, out):
-    """Widen rows beyond the panel's edges.
+    """Continue rows beyond the panel's edges.
 
     images: float32 (n, rows of the panel, cols).
-    first: row of the panel that is the first of `out`; rows beyond it repeat its outermost ones.
+    first: row of the panel that is the first of `out`; rows beyond it repeat its
+    outermost ones.
     before: columns of `out` before the panel's first.
     edge: columns at an edge whose mean goes on.
     lengths: (n, bands, wide) of `prism_lengths`.
     band, share: (rows,) lower band of each row, and how much the next one counts.
     cut: (rows,) how much of what the prisms leave at the edges goes on.
     fade: (wide,) part of it that is left in each column.
-    across, up: squares of the ray's horizontal and vertical parts, (n, wide) and (n, rows) [mm^2].
+    across, up: squares of the ray's horizontal and vertical parts, (n, wide) and (n,
+    rows) [mm^2].
     out: float32 (n, rows, wide).
     """
     n, rows, wide = out.shape
@@ -132,7 +137,9 @@ def continue_rows(images, first, before, edge, lengths, band, share, cut, fade, 
 
 @kernel
 def _cost(x, source, rays, length, seen, scale):
-    """Half the sum of Cauchy's losses of a prism's deviations, over the square of their scale."""
+    """Compute half the sum of Cauchy's losses of a prism's deviations, over their squared
+    scale.
+    """
     e, f = math.exp(x[2]), math.exp(x[3])
     attenuation = math.exp(x[5])
     total = 0.0
@@ -154,7 +161,9 @@ def _cost(x, source, rays, length, seen, scale):
 
 @kernel
 def _normal_equations(x, source, rays, length, seen, scale, slope, matrix, gradient):
-    """Curvature (6, 6) and gradient (6,) of `_cost`; slope: memory for six numbers."""
+    """Compute curvature (6, 6) and gradient (6,) of `_cost`; slope: memory for six
+    numbers.
+    """
     e, f = math.exp(x[2]), math.exp(x[3])
     attenuation = math.exp(x[5])
     matrix[:] = 0.0
@@ -196,7 +205,7 @@ def _normal_equations(x, source, rays, length, seen, scale, slope, matrix, gradi
 
 @kernel
 def _solved(matrix, gradient, free, damping, factor, step):
-    """Damped step of the free parameters, by Cholesky's factor; False where there is none."""
+    """Compute the damped step of the free parameters by Cholesky; False if there is none."""
     for a in range(PARAMETERS):
         step[a] = -gradient[a] if free[a] else 0.0
         for b in range(a + 1):

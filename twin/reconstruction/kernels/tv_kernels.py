@@ -33,7 +33,7 @@ def differences(x, k, j, i, scale):
 
 @parallel
 def variation(x, scale, layers, first, last):
-    """Total variation by layers (nz,) float64, which the caller adds up."""
+    """Compute total variation by layers (nz,) float64, which the caller adds up."""
     ny, nx = x.shape[1:]
     for k in prange(first, last):
         total = 0.0  # in double precision: millions of small lengths
@@ -46,7 +46,8 @@ def variation(x, scale, layers, first, last):
 
 @parallel
 def primal_step(z, dual, theta, scale, lowest, allowed, x, first, last):
-    """x = the allowed values next to z - theta D' dual, with the differences' transpose D'.
+    """Compute x, the allowed values next to z - theta D' dual, D' the transposed
+    differences.
 
     lowest: values are not less; allowed: uint8 (nz, ny, nx), 0 where x must be 0.
     """
@@ -73,8 +74,10 @@ def primal_step(z, dual, theta, scale, lowest, allowed, x, first, last):
 
 @parallel
 def dual_step(x, ahead, dual, rate, momentum, scale, first, last):
-    """dual = ahead + rate D x, shortened to length 1 voxel by voxel; then ahead = dual + momentum
-    times what dual has changed.
+    """Compute dual = ahead + rate D x, shortened to length 1 a voxel, and extrapolate
+    ahead.
+
+    ahead = dual + momentum times the change of dual.
     """
     ny, nx = x.shape[1:]
     one = np.float32(1)
