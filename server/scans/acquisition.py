@@ -28,17 +28,17 @@ Put = Callable[[str, npt.NDArray[np.uint16]], object]
 """Stores one image under a name; called from worker threads."""
 
 FrameListener = Callable[[Exposure, Radiograph], None]
-"""Told of the last projection of each batch: the frame and its image."""
+"""Called with the last projection of each batch: the frame and its image."""
 
 REMEMBERED = 2
-"""Frames before a frame that it may depend on."""
+"""Number of earlier frames that a frame may depend on."""
 RECENT = 16
-"""Images kept for the frames after them."""
+"""Number of images kept for later frames."""
 
 
 @dataclass(frozen=True)
 class Acquisition:
-    """What all frames of one scan share.
+    """The common data of all frames of one scan.
 
     Attributes:
         plan: the scan.
@@ -48,7 +48,8 @@ class Acquisition:
         put: stores an image.
         moments: poses averaged within the exposure of a frame taken in motion.
         shown: told of images for watchers.
-        ensure_same: raises if the sample has become another one; asked after each projection.
+        ensure_same: raises if the sample has become another one; asked after each
+            projection.
     """
 
     plan: ScanPlan
@@ -60,9 +61,9 @@ class Acquisition:
     shown: FrameListener | None = None
     ensure_same: Callable[[], None] = lambda: None
     _recent: dict[int, Radiograph] = field(default_factory=dict, init=False)
-    """Images by index that later frames may ask for."""
+    """Index -> image that later frames may need."""
     _trapped: dict[int, Float32Array] = field(default_factory=dict, init=False)
-    """By index of a frame, the charge in the panel's traps when it starts."""
+    """Frame index -> charge in the panel's traps at its start."""
     _trapping: asyncio.Lock = field(default_factory=asyncio.Lock, init=False)
 
     async def produce(self, batch: Sequence[Exposure]) -> None:
@@ -84,6 +85,7 @@ class Acquisition:
             self.shown(batch[-1], images[-1])
 
     async def _take(self, batch: Sequence[Exposure]) -> list[Radiograph]:
+        """Project a batch of frames and keep images that later frames may need."""
         if self.moments > 1:
             images = [(await self._project([e]))[0] for e in batch]
         else:
@@ -96,8 +98,10 @@ class Acquisition:
         return images
 
     async def _before(self, frame: Exposure) -> Before:
-        """Earlier frames that are still on the panel; made anew if they are not at hand, so that a
-        frame is the same whatever was made before it.
+        """Return the earlier frames that are still on the panel.
+
+        Missing ones are projected again, so that a frame does not depend on which were
+        made before it.
         """
         if not self.radiography.remembers:
             return ()
@@ -110,13 +114,16 @@ class Acquisition:
         return found
 
     async def _image(self, frame: Exposure) -> Radiograph:
-        """Of a frame with X-rays on; made anew if it is not at hand."""
+        """Return the image of a frame with X-rays on; it is projected again if not kept."""
         image = self._recent.get(frame.index)
         return (await self._take([frame]))[0] if image is None else image
 
     async def _traps(self, frame: Exposure) -> Float32Array | None:
-        """Charge in the panel's traps when a frame starts, from the first frame on, so that it is
-        the same wherever a scan was cut. Empty after a change of the camera's settings.
+        """Compute the charge in the panel's traps at a frame's start, from the first
+        frame on.
+
+        It is the same wherever a scan was interrupted, and empty after a change of the
+        camera's settings.
         """
         if not self.radiography.traps:
             return None
@@ -138,7 +145,7 @@ class Acquisition:
             return charge
 
     async def _project(self, batch: Sequence[Exposure]) -> list[Radiograph]:
-        """One view a frame, or several of one frame that is taken in motion."""
+        """Project one view a frame, or several views of one frame taken in motion."""
         frame = batch[0]
         if self.moments > 1 and frame.moving:
             positions = {n: table[frame.index] for n, table in self._moments.items()}
@@ -153,13 +160,13 @@ class Acquisition:
 
     @cached_property
     def _numbers(self) -> Mapping[str, int]:
-        """File -> number of the image among all that are saved."""
+        """File -> number of the image among all saved ones."""
         files = [e.file for e in self.plan.exposures if e.file is not None]
         return {file: i for i, file in enumerate(files)}
 
     @cached_property
     def _moments(self) -> Mapping[str, npt.NDArray[np.float64]]:
-        """Axis -> (images, moments) positions within each exposure."""
+        """Axis -> (images, moments) positions within each exposure [mm, deg]."""
         return self.plan.subframe_positions(self.moments)
 
     def _store(
@@ -169,6 +176,14 @@ class Acquisition:
         before: Sequence[Before],
         trapped: Sequence[Float32Array | None],
     ) -> None:
+        """Convert images to counts, with noise by frame, and store them.
+
+        Args:
+            batch: frames with files.
+            images: one for each frame.
+            before: earlier frames on the panel, for each frame.
+            trapped: charge in the panel's traps, for each frame.
+        """
         for frame, image, earlier, traps in zip(batch, images, before, trapped, strict=True):
             assert frame.file is not None
             rng = None if self.seed is None else frame_rng(self.seed, self._numbers[frame.file])
@@ -178,7 +193,7 @@ class Acquisition:
 
 
 def settings_of(frame: Exposure) -> ExposureSettings:
-    """Tube and camera during a frame."""
+    """Return the settings of tube and camera during a frame."""
     return ExposureSettings(
         frame.kV, frame.power_W, frame.exposure_ms, frame.averages, frame.xrays_on
     )

@@ -44,23 +44,24 @@ from flexdt.twin.script.parse import LIGHT_BYTES, is_light
 from flexdt.twin.script.planning.plan_values import SampleSize
 
 AT_ONCE: Final = 2
-"""Checks in worker processes at a time; others wait."""
+"""Largest number of checks in worker processes at a time; others wait."""
 SECONDS: Final = float(CHECK_LIMITS["seconds"])
 MEMORY_BYTES: Final = int(CHECK_LIMITS["memory_bytes"])
 MAX_PROBLEMS: Final = 1000
-"""Problems that an error or a job's warnings list; the others are counted."""
+"""Largest number of problems listed by an error or a job's warnings; others are
+counted."""
 STEP_BYTES: Final = 100
-"""Least that a step takes in a report, beside its texts."""
+"""Least size of a step in a report without its texts [bytes]."""
 ANSWER_PIECE: Final = 1 << 18
-"""Bytes of a report that travel together: nobody copies 50 MB in one go."""
+"""Size of a report's portions [bytes]: 50 MB are never copied at once."""
 A_PIECE: Final = 250
-"""Parts of a plan that are unpickled in one go."""
+"""Number of parts of a plan that are unpickled at a time."""
 _T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
 class CheckInput:
-    """What is checked, on what.
+    """A scan to be checked, and the conditions of the check.
 
     Attributes:
         wish: script or poses.
@@ -81,14 +82,17 @@ class CheckInput:
 
     @property
     def light(self) -> bool:
-        """Whether it takes no time worth the way to another process."""
+        """True if the check is too short to pay for another process."""
         script = self.wish.script
         if self.wish.poses is None:
             return is_light(script)
         return len(self.wish.poses.text) <= LIGHT_BYTES
 
     def report(self, bytes_at_most: int | None = None) -> CheckReport:
-        """Do it; blocks.
+        """Compute the dry-run report; blocks.
+
+        Args:
+            bytes_at_most: largest size of the report; None for no limit.
 
         Raises:
             RpcError: -32008, the report would be larger than that; nothing is swept then.
@@ -121,11 +125,11 @@ class CheckInput:
 
 @dataclass(frozen=True, eq=False)
 class Checked:
-    """A scan that was found sound: the certificate of its plan.
+    """Result of a successful check: the plan with its certificate.
 
     Attributes:
-        matter: what was checked. Nothing else enters a plan, so a scan with an equal input has this
-            plan and needs no other check.
+        matter: what was checked. Nothing else enters a plan, so a scan with an equal
+            input has this plan and needs no other check.
         plan: of the scan.
         warnings: in words.
     """
@@ -136,7 +140,7 @@ class Checked:
 
 
 class Checks:
-    """Checks of one server; `close` it in the end.
+    """Runs the checks of one server; `close` must be called at the end.
 
     Args:
         apart: whether what takes long is done in other processes.
@@ -150,7 +154,7 @@ class Checks:
         self._turn = asyncio.Semaphore(AT_ONCE)
 
     async def report(self, matter: CheckInput, codec: Codec) -> Sequence[bytes]:
-        """The dry-run report, encoded.
+        """Compute the dry-run report, encoded in portions.
 
         Raises:
             RpcError: -32008, it is larger than an answer may be or takes too long.
@@ -160,14 +164,15 @@ class Checks:
         return await self._workers.ask(_encoded, _bare(matter), codec)
 
     async def sound(self, matter: CheckInput) -> Checked:
-        """A scan parsed, planned and swept, if it may run.
+        """Parse, plan and sweep a scan and return it if it may run.
 
-        The last one is kept until it is asked for again: when a job begins where it was submitted,
-        with the same sample and correction, the plan is the one that was checked then.
+        The last result is kept until it is requested again: if a job begins with the
+        position, sample and correction that it was submitted with, the plan is the one
+        checked then.
 
         Raises:
-            RpcError: -32005 or -32002, it may not run; -32008, it takes too long or too much
-                memory.
+            RpcError: -32005 or -32002, it may not run; -32008, it takes too long or too
+                much memory.
         """
         last, self._last = self._last, None
         if last is not None and last.matter == matter:
@@ -184,7 +189,7 @@ class Checks:
         return self._last
 
     def _here(self, matter: CheckInput) -> bool:
-        """Whether to check in a thread: what is light, while there is no process for it."""
+        """Return whether to check in a thread: light scans, while no process is free."""
         return not self._apart or (matter.light and not self._workers.ready)
 
     async def _threaded(self, do: Callable[[], _T]) -> _T:
@@ -197,7 +202,7 @@ class Checks:
 
 
 def planned(matter: CheckInput) -> tuple[ScanPlan, list[str]]:
-    """The plan of a scan and its warnings in words; blocks.
+    """Return the plan of a scan and its warnings in words; blocks.
 
     Raises:
         RpcError: -32005 or -32002, it may not run.
@@ -210,13 +215,13 @@ def planned(matter: CheckInput) -> tuple[ScanPlan, list[str]]:
 
 
 def in_pieces(matter: CheckInput) -> list[bytes]:
-    """In the worker: the warnings as JSON, then the plan in pieces."""
+    """Check in the worker: returns the warnings as JSON, then the plan in pieces."""
     plan, warnings = planned(matter)
     return [json.dumps(warnings).encode(), *_pieces_of(plan)]
 
 
 def _bare(matter: CheckInput) -> CheckInput:
-    """Without the listing of poses, which only people read."""
+    """Return the input without the listing of poses, which only people read."""
     wish = matter.wish
     if wish.poses is None:
         return matter
@@ -233,6 +238,8 @@ def _encoded(matter: CheckInput, codec: Codec) -> list[bytes]:
 
 
 def _bounded(sweep: dry_run.CollisionCheck, most: int | None) -> dry_run.CollisionCheck:
+    """Wrap a sweep so that it refuses plans whose report would be over `most` bytes."""
+
     def bounded(
         plan: ScanPlan, machine: Machine, profile: Profile, size: SampleSize | None
     ) -> Clearance:
@@ -280,7 +287,7 @@ def require_sound(report: CheckReport) -> None:
 
 
 def _worst(problems: list[ScriptProblem]) -> Sequence[ScriptProblem]:
-    """No more than may be listed, errors rather than warnings, in the order they had."""
+    """Select as many problems as may be listed, errors before warnings, in their order."""
     if len(problems) <= MAX_PROBLEMS:
         return problems
     return [p for p in problems if p.severity == "error"][:MAX_PROBLEMS]
@@ -290,7 +297,8 @@ def _worst(problems: list[ScriptProblem]) -> Sequence[ScriptProblem]:
 
 
 def _pieces_of(plan: ScanPlan) -> list[bytes]:
-    """A plan without its machine and profile, each piece small enough to be unpickled at once.
+    """Pickle a plan without machine and profile in pieces small enough to be read at
+    once.
 
     Each piece is (field or axis, some of its parts); files are apart from their groups.
     """
@@ -311,7 +319,7 @@ def _pieces_of(plan: ScanPlan) -> list[bytes]:
 
 
 def _joined(pieces: list[bytes], machine: Machine, profile: Profile) -> ScanPlan:
-    """The plan of `_pieces_of`; in a thread, that others come to work between the pieces."""
+    """Rebuild the plan of `_pieces_of`; in a thread, so that others run between pieces."""
     with _no_collection():
         short = pickle.loads(pieces[0])
         long: dict[str, list[Any]] = {}
@@ -331,8 +339,9 @@ def _joined(pieces: list[bytes], machine: Machine, profile: Profile) -> ScanPlan
 
 @contextmanager
 def _no_collection() -> Iterator[None]:
-    """Without the collector of cyclic garbage: a million new objects would set it off again and
-    again, and each of its passes holds the interpreter.
+    """Disable the collector of cyclic garbage within the context.
+
+    A million new objects would start it repeatedly, and each pass holds the interpreter.
     """
     on = gc.isenabled()
     gc.disable()

@@ -19,7 +19,7 @@ T = TypeVar("T")
 
 @dataclass(eq=False, repr=False)
 class FramePipeline(Generic[T]):
-    """A bounded queue of frames and the workers that empty it.
+    """A bounded queue of frames with workers that process them.
 
     Attributes:
         produce: makes and stores a batch; raises what `failed` is to hear.
@@ -51,12 +51,12 @@ class FramePipeline(Generic[T]):
 
     @property
     def full(self) -> bool:
-        """Whether no frame can be put now."""
+        """True if no frame can be added now."""
         return len(self._waiting) >= self.room
 
     @property
     def idle(self) -> bool:
-        """Whether every frame put in has been made."""
+        """True if all added frames have been made."""
         return not self._waiting and self._busy == 0
 
     async def put(self, frame: T) -> None:
@@ -82,6 +82,7 @@ class FramePipeline(Generic[T]):
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
     async def _work(self) -> None:
+        """Process batches of waiting frames until cancelled."""
         while True:
             async with self._changed:
                 await self._changed.wait_for(lambda: bool(self._waiting))
@@ -94,6 +95,7 @@ class FramePipeline(Generic[T]):
                 self._changed.notify_all()
 
     def _take(self) -> list[T]:
+        """Remove a batch of consecutive frames of one kind from the queue."""
         batch = [self._waiting.popleft()]
         kind = self.kind(batch[0])
         while self._waiting and len(batch) < self.batch and self.kind(self._waiting[0]) == kind:
@@ -101,6 +103,7 @@ class FramePipeline(Generic[T]):
         return batch
 
     async def _until_made(self, batch: Sequence[T]) -> None:
+        """Produce a batch; after a failure report it, wait for `_go` and try again."""
         while True:
             try:
                 await self.produce(batch)

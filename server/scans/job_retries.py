@@ -16,11 +16,11 @@ from flexdt.runtime.wire_errors import ProjectorUnavailable
 from flexdt.twin.dataset.dataset_errors import DiskFullError
 
 FIRST_S, LONGEST_S = 1.0, 30.0
-"""Between attempts, the first and the longest [real s]."""
+"""First and longest delay between attempts [real s]."""
 
 
 def transient(error: Exception | None) -> bool:
-    """Whether waiting may help."""
+    """Return whether waiting may remove an error."""
     return isinstance(error, (DiskFullError, ProjectorUnavailable))
 
 
@@ -39,7 +39,7 @@ class Retry:
 
     @property
     def waits_s(self) -> float | None:
-        """Seconds until the next attempt, None when there will be none by itself."""
+        """Seconds until the next attempt; None if there is no automatic one."""
         if self._task is None or self._task.done():
             return None
         return max(0.0, self._at - asyncio.get_running_loop().time())
@@ -58,7 +58,7 @@ class Retry:
             self._attempts = 0
 
     def cancel(self) -> None:
-        """Somebody takes over, or the job has ended."""
+        """Cancel the next attempt: a user takes over, or the job has ended."""
         if self._task is not None:
             self._task.cancel()
             self._task = None
@@ -75,7 +75,7 @@ class Retry:
 
 
 def _has_room(error: DiskFullError) -> bool:
-    """Whether what could not be written would fit now, where the system tells."""
+    """Return whether the unwritten data would fit now, if the system reports it."""
     data = error.data if isinstance(error.data, Mapping) else {}
     path, need = data.get("path"), data.get("bytes")
     if not isinstance(path, str) or not isinstance(need, int):

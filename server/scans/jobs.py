@@ -34,7 +34,7 @@ from flexdt.twin.script import Exposure, ScanPlan
 
 PUBLISH_INTERVAL_S = 0.1
 NAMED = 20
-"""Jobs that an error lists, the newest."""
+"""Number of the newest jobs that an error lists."""
 
 
 class Jobs:
@@ -70,7 +70,7 @@ class Jobs:
         self._scanner, self._clock, self._notify = scanner, clock, changed
         self._all: dict[str, Job] = {}
         self._changed: set[str] = set()
-        """Jobs that have changed, or are forgotten, since `changed` was called last."""
+        """Names of jobs changed or forgotten since the last call of `changed`."""
         self._queue: asyncio.Queue[Job] = asyncio.Queue()
         self._count = 0
         self.current: Job | None = None
@@ -78,23 +78,24 @@ class Jobs:
         self.max_waiting = max_waiting
         self.frames_made = 0
         self._preparing = False
-        """Whether the current job is being opened: what it is checked with must stay."""
+        """True while the current job is being opened: its checked conditions must not
+        change."""
         self._by_hand = False
-        """Whether only `resume` lets the current job go on, whatever stopped it."""
+        """True if only `resume` continues the current job, whatever stopped it."""
         self._interrupted: Exception | None = None
-        """The last stop from outside since the current job's turn came."""
+        """Last stop from outside since the current job's turn."""
 
     # Asking -------------------------------------------------------------------------------------
 
     def all(self) -> list[Job]:
-        """Every job, oldest first."""
+        """List every job, oldest first."""
         return list(self._all.values())
 
     def get(self, job: str | None) -> Job:
-        """The job called `job`; the current or else the last one if None.
+        """Return the job named `job`, or for None the current or else the last one.
 
         Raises:
-            UnknownNameError: lists the jobs there are.
+            UnknownNameError: lists the existing jobs.
         """
         if job is None and self.current is not None:
             return self.current
@@ -111,12 +112,12 @@ class Jobs:
 
     @property
     def running(self) -> bool:
-        """Whether a job moves the scanner now (a paused one does not)."""
+        """True while a job moves the scanner (not while it is paused)."""
         return self.current is not None and self.current.phase == "running"
 
     @property
     def busy(self) -> bool:
-        """Whether frames are being made, or time runs as fast as it may under a job."""
+        """True while frames are being made, or time runs at maximum speed for a job."""
         job = self.current
         if job is None or job.phase != "running":
             return False
@@ -124,7 +125,11 @@ class Jobs:
         return runner is None or not runner.idle or self._clock.speed_up == "max"
 
     def require_idle(self, what: str) -> None:
-        """Refuse what would disturb a job that runs, is being opened, or was told to go on.
+        """Refuse a command that would disturb a job that runs, opens or was told to
+        resume.
+
+        Args:
+            what: command, for the message.
 
         Raises:
             RpcError: -32003, names the job.
@@ -143,8 +148,10 @@ class Jobs:
 
     @contextmanager
     def manual_control(self) -> Iterator[None]:
-        """Manual control cancels the automatic resume of a paused job, unless the command is
-        refused before anything has moved."""
+        """Cancel the automatic resume of a paused job for a manual command.
+
+        It is kept if the command is refused before anything has moved.
+        """
         by_hand, programmes = self._by_hand, self._scanner.programmes
         self._by_hand = True
         try:
@@ -159,26 +166,26 @@ class Jobs:
         self.retry.cancel()
 
     def uses(self, folder: str) -> bool:
-        """Whether a job that has not ended writes into `folder`."""
+        """Return whether a job that has not ended writes into `folder`."""
         return any(j.folder == folder and j.phase not in ENDED for j in self._all.values())
 
     def showing(self, sample: str) -> Job | None:
-        """A job that has not ended and shows the sample of that name."""
+        """Return a job that has not ended and uses the sample of that name, or None."""
         unended = (j for j in self._all.values() if j.phase not in ENDED)
         return next((j for j in unended if j.sample is not None and j.sample.name == sample), None)
 
     def shows(self, sample: Sample) -> None:
-        """The current job shows this sample."""
+        """Set the sample of the current job."""
         if self.current is not None:
             self.current.sample = sample
 
     def samples(self) -> list[Sample]:
-        """What the jobs that have not ended show."""
+        """List the samples of jobs that have not ended."""
         unended = (j for j in self._all.values() if j.phase not in ENDED)
         return [j.sample for j in unended if j.sample is not None]
 
     def status(self, job: Job) -> JobStatus:
-        """A job as the wire has it."""
+        """Convert a job to its wire form."""
         p = job.where
         step = None if p is None else p.step
         return JobStatus(
@@ -216,16 +223,17 @@ class Jobs:
         job: Job | None = None,
         sample: Sample | None = None,
     ) -> Job:
-        """The next job, or one that has ended as it will be; nobody knows it until `enqueue`.
+        """Prepare the next job, or a new state of one that has ended; `enqueue` makes it
+        known.
 
         Args:
             name, folder: of the data set.
             plan, prepare, speed_up, warnings: of the scan.
-            job: that goes on; None for a new one.
-            sample: that it shows.
+            job: ended job to continue; None for a new one.
+            sample: sample of the scan.
 
         Raises:
-            RpcError: -32003, too many wait already, or it has not ended.
+            RpcError: -32003, too many jobs wait, or the job has not ended.
         """
         waiting = sum(each.phase == "queued" for each in self._all.values())
         if waiting >= self.max_waiting:
@@ -293,7 +301,9 @@ class Jobs:
             self._tell(job)
 
     def interrupt(self, reason: Exception) -> None:
-        """Motion was stopped from outside (stop, E-stop): pause what runs or is about to."""
+        """Pause the job that runs or is about to, after a stop from outside (stop,
+        E-stop).
+        """
         self._take_over()
         self._interrupted = reason
         runner = None if self.current is None else self.current.runner
@@ -309,23 +319,25 @@ class Jobs:
 
     @property
     def made(self) -> int:
-        """Jobs there ever were."""
+        """Number of all jobs so far."""
         return self._count
 
     def changed(self) -> dict[str, JobMemory | None]:
-        """Jobs that have changed since the last call; None for one that is forgotten."""
+        """Return jobs changed since the last call by name; None for a forgotten one."""
         names, self._changed = self._changed, set()
         known = {name: self._all.get(name) for name in sorted(names, key=number_of)}
         return {name: None if job is None else job.memory() for name, job in known.items()}
 
     def kept_of(self, jobs: Sequence[JobMemory]) -> list[JobMemory]:
-        """Those of a server before this one, the oldest first, that are not forgotten at once."""
+        """Select the jobs of an earlier server that are not forgotten at once, oldest
+        first.
+        """
         ended = [job.id for job in jobs if job.phase in ENDED]
         forgotten = set(ended[: max(0, len(ended) - self._max_ended)])
         return [job for job in jobs if job.id not in forgotten]
 
     def recall(self, jobs: Sequence[JobMemory], made: int, root: Directory) -> list[Job]:
-        """Know the jobs of the server before this one; returns those that it left undone."""
+        """Restore the jobs of an earlier server; returns the unfinished ones."""
         self._count = max(self._count, made, *(number_of(memory.id) for memory in jobs))
         left = []
         for memory in jobs:
@@ -338,11 +350,11 @@ class Jobs:
         return left
 
     def ended(self, job: str | None, min_age: timedelta) -> list[Job]:
-        """The ended jobs that were asked for, to be forgotten.
+        """Select the ended jobs to be forgotten.
 
         Args:
-            job: its name; None for all of at least an age.
-            min_age: since they ended; of a job that is named it does not matter.
+            job: its name; None for all that ended long enough ago.
+            min_age: least time since their end; not used for a named job.
 
         Raises:
             UnknownNameError: there is no such job.
@@ -356,7 +368,7 @@ class Jobs:
         return [found]
 
     def forget(self, jobs: Iterable[Job]) -> None:
-        """Know these jobs no longer; their data sets stay."""
+        """Remove these jobs from the list; their data sets stay."""
         for job in jobs:
             if self._all.get(job.id) is job:
                 del self._all[job.id]
@@ -452,7 +464,7 @@ class Jobs:
         return "done"
 
     async def _runner_of(self, job: Job, scan: JobInputs) -> ScanRunner:
-        """Made in a thread: it puts the events of a long plan in order."""
+        """Create the runner in a thread, as it sorts the events of a long plan."""
         self._preparing = True
         try:
             return await asyncio.to_thread(
@@ -500,6 +512,7 @@ class Jobs:
         )
 
     def _progress(self, job: Job) -> None:
+        """Take over the runner's progress and error, and publish them if due."""
         assert job.runner is not None
         p = job.runner.progress
         phase = job.phase
@@ -519,7 +532,9 @@ class Jobs:
             self._tell(job)
 
     def _go_on_later(self) -> None:
-        """Try again what a full disk or a projector paused, unless somebody took over."""
+        """Schedule a retry after a pause by a full disk or a projector, unless a user
+        took over.
+        """
         job = self.current
         if job is None or job.runner is None or self._by_hand:
             return
@@ -533,7 +548,7 @@ class Jobs:
 
 
 def _logged(produce: Produce, job: str) -> Produce:
-    """`produce`, with what nobody but a programmer can cause in the server's log."""
+    """Wrap `produce` so that programming errors go to the server's log."""
 
     async def work(batch: Sequence[Exposure]) -> None:
         try:
@@ -548,5 +563,5 @@ def _logged(produce: Produce, job: str) -> Produce:
 
 
 def fresh_seed() -> int:
-    """A seed for a new scan's noise."""
+    """Draw a seed for a new scan's noise."""
     return secrets.randbits(32)

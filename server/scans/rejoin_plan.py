@@ -25,7 +25,7 @@ from flexdt.twin.script import ScanPlan
 
 @dataclass(frozen=True)
 class Rejoin:
-    """What it takes to be on `plan` at plan time `tau`.
+    """The motions that lead to `plan` at plan time `tau`.
 
     Attributes:
         start: axis -> position at rest from which to begin [mm, deg].
@@ -39,7 +39,9 @@ class Rejoin:
     _motion: Mapping[str, tuple[float, float, float]]
 
     def programme(self) -> dict[str, tuple[Trajectory, ...]]:
-        """Trajectories on a clock that shows 0 when a scanner at rest at `start` sets off."""
+        """Compute trajectories on a clock that is 0 when a scanner at rest at `start`
+        sets off.
+        """
         join = self.run_up_s
         out = {}
         for axis, (position, velocity, acceleration) in self._motion.items():
@@ -56,11 +58,11 @@ class Rejoin:
 
 
 def rejoin(plan: ScanPlan, tau: float, accelerations: Mapping[str, float]) -> Rejoin:
-    """How to be on `plan` at plan time `tau` [s].
+    """Plan the way to `plan` at plan time `tau` [s].
 
     Args:
         plan: the scan.
-        tau: when, on the plan's clock.
+        tau: time on the plan's clock [s].
         accelerations: of each axis's run-up.
     """
     start, moving, run_up = {}, {}, 0.0
@@ -76,7 +78,7 @@ def rejoin(plan: ScanPlan, tau: float, accelerations: Mapping[str, float]) -> Re
 def _remaining(
     trajectories: tuple[tuple[float, Trajectory], ...], tau: float
 ) -> tuple[Trajectory, ...]:
-    """What is still to come of one axis's trajectories, the one in force at `tau` cut."""
+    """Select an axis's trajectories from `tau` on, the current one cut."""
     begun = [t for time, t in trajectories if time <= tau]
     later = tuple(t for time, t in trajectories if time > tau)
     if not begun or tau >= begun[-1].end:

@@ -27,7 +27,7 @@ from flexdt.twin.script import commands as c
 BATCH = 4
 WORKERS = 2
 CHECKS = 3
-"""How often the rest of a plan is swept before a run that others disturb gives up."""
+"""Sweeps of the rest of a plan before a run gives up because others move the scanner."""
 ROOM = 16
 Produce = Callable[[Sequence[Exposure]], Awaitable[None]]
 Phase = Literal["running", "paused", "done"]
@@ -62,21 +62,21 @@ def apply_command(scanner: ScannerTwin, command: c.Command, now: float) -> None:
 
 
 def _allowed(scanner: ScannerTwin, axis: str, value: float, limit: str) -> float:
-    """A rate above the limit is clamped, as the plan did (it has warned, or refused the script)."""
+    """Limit a rate as the plan did (it has warned, or refused the script)."""
     moves = scanner.machine.moves(axis)
     limits = [getattr(scanner.machine.axes[m], limit) / abs(f) for m, f in moves.items()]
     return min([value, *map(float, limits)])
 
 
 def hopeless(error: Exception) -> bool:
-    """Whether the same work would meet it again, whoever tries: a limit of what is computed."""
+    """Return whether a repetition would fail as well, by a limit of the computation."""
     if isinstance(error, RpcError):  # a sample that no projector can hold
         return error.code == Code.TOO_LARGE
     return isinstance(error, (LimitError, GeometryError)) or type(error) is TwinError
 
 
 class JobAborted(Exception):
-    """Somebody ended the job, for the reason given."""
+    """A user ended the job, for the reason given."""
 
     def __init__(self, reason: str | None = None) -> None:
         super().__init__(f"aborted: {reason}" if reason else "aborted")
@@ -84,7 +84,7 @@ class JobAborted(Exception):
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a run is. `tau` is the plan's clock [s]."""
+    """State of a run; `tau` is the plan's clock [s]."""
 
     phase: Phase = "running"
     tau: float = 0.0
@@ -127,15 +127,16 @@ class ScanRunner:
         """Twin time of the plan's zero [s]; a pause moves it."""
         self._pause = self._abort = False
         self._stop_due = False
-        """Whether a pause was asked for that the run has not obeyed yet, even if it may go on."""
+        """True from the request of a pause until the run obeys, even if it was resumed
+        since."""
         self._end: Exception = JobAborted()
-        """What is raised when the run is told to end."""
+        """Exception raised when the run must end."""
         self._stepping = False
         self._steps = 0
-        """How often a step was asked for."""
+        """Number of requested steps."""
         self._kept: _Settings | None = None
         self._moves = False
-        """Whether the run has set motors going since it was last told to go on."""
+        """True if the run has started motors since the last resume."""
         self._signal = asyncio.Event()
         self._waiting: asyncio.Future[None] | None = None
         self._pipeline: FramePipeline[Exposure] = FramePipeline(
@@ -160,7 +161,7 @@ class ScanRunner:
         self._wake()
 
     def resume(self) -> None:
-        """Go back to the pose of the pause and on from there; an error from now on is a new one."""
+        """Return to the pose of the pause and continue; later errors count as new."""
         self._pause = self._stepping = False
         self._set(error=None)
         self._wake()
@@ -181,17 +182,17 @@ class ScanRunner:
 
     @property
     def paused(self) -> bool:
-        """Whether it was told to pause and not yet to go on."""
+        """True from the request of a pause until the resume."""
         return self._pause
 
     @property
     def stepping(self) -> bool:
-        """Whether a step was asked for that has not ended."""
+        """True while a requested step has not ended."""
         return self._stepping
 
     @property
     def idle(self) -> bool:
-        """Whether no frame is being made at this moment."""
+        """True if no frame is being made."""
         return self._pipeline.idle
 
     # Running ------------------------------------------------------------------------------------
@@ -261,6 +262,7 @@ class ScanRunner:
         self._set(frames_done=self.progress.frames_done + made)
 
     async def _take_effect(self, step: PlanStep) -> None:
+        """Apply a command of the plan; after an error pause, and try again on resume."""
         self._set(step=step, what=step.what)
         while True:
             try:
@@ -301,7 +303,7 @@ class ScanRunner:
             self._waiting.set_result(None)
 
     async def _obey(self, tau: float) -> None:
-        """Do what was asked for: end, or pause until told to go on."""
+        """Obey requests: end the run, or pause it until it is resumed."""
         if self._abort:
             raise self._end
         if not self._told():
@@ -335,7 +337,7 @@ class ScanRunner:
         self._kept = None
 
     async def _until_told(self, tau: float) -> None:
-        """Stand paused until resume, step or abort."""
+        """Pause until resume, step or abort."""
         self._stop_due = False
         if self._pause:
             self._set(phase="paused", tau=tau)
@@ -346,7 +348,7 @@ class ScanRunner:
             raise self._end
 
     async def _rejoin_or_pause(self, tau: float) -> None:
-        """Onto the plan at its beginning; what stands in the way pauses the run."""
+        """Move to the plan's beginning; an obstacle pauses the run."""
         if not self._told():
             try:
                 await self._rejoin(tau)
@@ -356,10 +358,10 @@ class ScanRunner:
             await self._obey(tau)
 
     async def _rejoin(self, tau: float) -> None:
-        """Return to where the plan is at `tau`; gives up early when told to pause or end.
+        """Move to the plan's position at `tau`; ends early on a pause or an abort.
 
         Raises:
-            CollisionError: the way there, or anything of the plan that is still to come.
+            CollisionError: on the way there, or in the rest of the plan.
         """
         paces = {axis: pace[1] for axis, pace in self.scanner.paces.items()}
         way = rejoin(self.plan, tau, paces)
@@ -447,7 +449,7 @@ class ScanRunner:
 
 @dataclass(frozen=True)
 class _Settings:
-    """What an operator may change while a run is paused."""
+    """The settings that an operator may change while a run is paused."""
 
     tube: TubeSettings
     camera: CameraSettings
@@ -472,7 +474,9 @@ class _Settings:
 def _events(
     steps: Sequence[PlanStep], frames: Sequence[Exposure]
 ) -> list[tuple[float, PlanStep | Exposure]]:
-    """Commands and frames by time; at one moment a command comes before its own frames."""
+    """Sort commands and frames by time; at equal times a command is before its own
+    frames.
+    """
     keyed: list[tuple[tuple[float, int, int], PlanStep | Exposure]] = []
     keyed += [((s.start_s, s.index, 0), s) for s in steps]
     keyed += [((e.start_s, e.step, 1), e) for e in frames]

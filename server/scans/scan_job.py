@@ -25,7 +25,7 @@ ENDED: tuple[JobPhase, ...] = get_args(EndedPhase)
 
 @dataclass(frozen=True)
 class JobInputs:
-    """What a job needs to run; made when its turn comes."""
+    """The inputs of a running job, made when its turn comes."""
 
     plan: ScanPlan
     store: DatasetWriter
@@ -46,7 +46,7 @@ class Job:
     folder: str
     prepare: Prepare | None = None
     sample: Sample | None = None
-    """What it shows, as far as that is known before its turn."""
+    """Sample of the scan, if known before its turn."""
     frames_total: int = 0
     duration_s: float = 0.0
     speed_up: SpeedUp | None = None
@@ -59,42 +59,42 @@ class Job:
     published_at: float = 0.0
     frames_seen: int = 0
     ended: datetime | None = None
-    """When it ended, by the server's calendar."""
+    """End by the server's calendar."""
     ended_by: str | None = None
-    """The connection that aborted it."""
+    """Connection that aborted the job."""
     start: dict[str, float] | None = None
-    """Where the motors stood when it began [mm, deg]."""
+    """Motor positions at its beginning [mm, deg]."""
     logged: str = ""
-    """The state that the topic `log` was last told."""
+    """State last sent to the topic `log`."""
 
     @property
     def where(self) -> Progress | None:
-        """How far it is, or was when it ended."""
+        """Progress now, or at its end."""
         return self.last if self.runner is None else self.runner.progress
 
     @property
     def frames_done(self) -> int:
-        """Frames that are there."""
+        """Number of finished frames."""
         return 0 if self.where is None else self.where.frames_done
 
     @property
     def elapsed_s(self) -> float:
-        """Of the plan's time [s]."""
+        """Elapsed time of the plan [s]."""
         return 0.0 if self.where is None else max(0.0, self.where.tau)
 
     def memory(self) -> JobMemory:
-        """What to know of it after a restart."""
+        """Return the record of the job that is kept for a restart."""
         known = {name: getattr(self, name) for name in JobMemory.model_fields}
         return JobMemory(**known | {"folder": Path(self.folder).name})
 
 
 def recalled(memory: JobMemory, root: Directory, now: datetime) -> Job:
-    """A job of the server before this one; one that was not ended is incomplete and says so.
+    """Restore a job of an earlier server; one that had not ended is marked incomplete.
 
     Args:
-        memory: as it was.
+        memory: its record.
         root: the data directory.
-        now: taken for its end where that is not known.
+        now: its end if that is unknown.
     """
     folder = root.folder(memory.folder)
     known = memory.model_dump(exclude={"folder", "elapsed_s", "frames_done"})
@@ -119,7 +119,7 @@ def recalled(memory: JobMemory, root: Directory, now: datetime) -> Job:
 
 
 def is_complete(folder: Directory) -> bool:
-    """Whether a data set lies there that says that it is complete."""
+    """Return whether a folder has a data set that is marked complete."""
     try:
         return read_document(folder).complete
     except (OSError, DatasetError):

@@ -51,20 +51,20 @@ class PoseList:
 
     @classmethod
     def of(cls, poses: Iterable[Mapping[str, float]]) -> PoseList:
-        """These poses."""
+        """Make the list from poses."""
         each = [json.dumps(dict(p)) for p in poses]
         listing = "\r\n".join([*(f"# pose {i}: {p}" for i, p in enumerate(each)), ""])
         return cls(f"[{', '.join(each)}]".encode(), listing.encode())
 
     def decoded(self) -> Poses:
-        """As lists and dictionaries."""
+        """Return the poses as lists and dictionaries."""
         poses: Poses = json.loads(self.text)
         return poses
 
 
 @dataclass(frozen=True)
 class ScanSource:
-    """What somebody wants scanned: a script's bytes, or poses.
+    """A requested scan: a script's bytes, or poses.
 
     Attributes:
         script: byte for byte, for a script; for poses a text that lists them.
@@ -91,7 +91,7 @@ class ScanSource:
         seed: int | None = None,
         flat: bool | Mapping[str, float] = True,
     ) -> ScanSource:
-        """A trajectory; its `script.txt` is a comment for each pose."""
+        """Make a scan from a trajectory; its `script.txt` has a comment for each pose."""
         poses = poses if isinstance(poses, PoseList) else PoseList.of(poses)
         head = f"# trajectory, exposure_ms {exposure_ms}, flat {json.dumps(flat)}\r\n".encode()
         return cls(head + poses.listing, poses, exposure_ms, moments, seed, flat)
@@ -99,11 +99,11 @@ class ScanSource:
 
 @dataclass(frozen=True)
 class StartConditions:
-    """What a scan starts from, kept so that it can be resumed.
+    """Conditions at a scan's start, kept so that it can be resumed.
 
     Attributes:
-        revision: names what the sample's upload showed then; None for a shipped phantom, and in
-            what older servers wrote.
+        revision: names what the sample's upload showed then; None for a shipped phantom,
+            and in what older servers wrote.
     """
 
     start: StartState
@@ -116,12 +116,12 @@ class StartConditions:
 
 
 BEGINNING: Final = TypeAdapter(StartConditions)
-"""Reads what `asdict` of a beginning made; raises ValueError if it did not."""
+"""Reads the `asdict` form of start conditions; raises ValueError for another form."""
 
 
 @dataclass(frozen=True)
 class JobRecord:
-    """Everything that is kept beside a data set.
+    """The data kept with a data set.
 
     Attributes:
         wish: what was asked for.
@@ -145,7 +145,7 @@ class JobRecord:
             self.keep(changes, root, name)
 
     def keep(self, changes: Changes, root: Directory, name: str) -> None:
-        """As `write`, among other changes."""
+        """Write the record as `write` does, as one of several changes."""
         wish = self.wish
         document = {
             "schema": SCHEMA,
@@ -184,10 +184,10 @@ class JobRecord:
 
     @classmethod
     def read(cls, root: Directory, name: str) -> JobRecord:
-        """The one of the data set `name`; one that is damaged is set aside.
+        """Read the record of the data set `name`; a damaged one is set aside.
 
         Raises:
-            FileNotFoundError: there is none, or none any more.
+            FileNotFoundError: there is no record, or no valid one.
         """
         file = f"{file_stem(name)}.json"
         without = "what a scan started from cannot be read; it cannot be resumed"
@@ -198,6 +198,7 @@ class JobRecord:
 
     @classmethod
     def _of(cls, data: bytes) -> JobRecord:
+        """Decode a record from its bytes."""
         document: Any = read_json(data)
         if document["schema"] != SCHEMA:
             raise ValueError(f"it has schema {document['schema']}, not {SCHEMA}")

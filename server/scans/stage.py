@@ -40,9 +40,9 @@ from flexdt.twin.script.planning.plan_values import SampleSize
 KEPT = 8
 MAX_BYTES: Final = 64 << 20
 HEADER, FACE = 84, 50
-"""Bytes of binary STL: before the faces, and of each."""
+"""Size of binary STL before the faces, and of each face [bytes]."""
 _Content = tuple[Sample, str | None]
-"""A sample and what its upload held: another file may come under the same name."""
+"""A sample and the revision of its upload: another file may get the same name."""
 
 
 class Stage:
@@ -59,7 +59,7 @@ class Stage:
         self._pieces: OrderedDict[_Content, tuple[Polytope, ...]] = OrderedDict()
 
     def phantom(self, sample: Sample) -> Phantom | None:
-        """The phantom behind a sample; None for an empty stage.
+        """Load the phantom of a sample; None for an empty stage.
 
         Raises:
             UnknownNameError, LimitError, PhantomError: see `SampleStore.load`.
@@ -71,11 +71,11 @@ class Stage:
         return self._samples.revision(sample.name)
 
     def pieces(self, sample: Sample, upload: ReceivedSample | None = None) -> tuple[Polytope, ...]:
-        """Convex pieces that hold the sample, object frame; it may take a second.
+        """Compute convex pieces that contain the sample, object frame; may take a second.
 
         Args:
             sample: on the stage.
-            upload: to come under the sample's name; None for what is there.
+            upload: next upload under the sample's name; None for the present one.
         """
         before = self._content(sample, upload)
         pieces = self._pieces.get(before)
@@ -92,7 +92,9 @@ class Stage:
         return pieces
 
     def size(self, sample: Sample) -> SampleSize | None:
-        """The cylinder about the axis that holds the sample."""
+        """Compute the cylinder about the axis that contains the sample; None for an empty
+        stage.
+        """
         phantom = self.phantom(sample)
         if phantom is None:
             return None
@@ -101,11 +103,12 @@ class Stage:
     def scene(
         self, sample: Sample, parameters: Offsets = NOMINAL, upload: ReceivedSample | None = None
     ) -> CollisionScene | None:
-        """What may touch what with this sample; None where the machine has no components.
+        """Build the scene of bodies that may collide; None for a machine without
+        components.
 
         Args:
-            sample: what stands there.
-            parameters: the correction in force; bodies sit where it says they are.
+            sample: on the stage.
+            parameters: applied correction, which moves the bodies.
             upload: as for `pieces`.
         """
         if not self._machine.components:
@@ -123,11 +126,12 @@ class Stage:
     def guard(
         self, sample: Sample, parameters: Offsets = NOMINAL, upload: ReceivedSample | None = None
     ) -> Guard | None:
-        """What sweeps every motion with this sample; None where the machine has no components.
+        """Create the guard that sweeps every motion; None for a machine without
+        components.
 
         Args:
-            sample: what stands there.
-            parameters: the correction in force.
+            sample: on the stage.
+            parameters: applied correction.
             upload: as for `pieces`.
         """
         scene = self.scene(sample, parameters, upload)
@@ -145,7 +149,7 @@ def _pieces(phantom: Phantom, offset: StagePlacement) -> tuple[Polytope, ...]:
 
 @dataclass(frozen=True)
 class Shape:
-    """The mesh of a sample as binary STL, and the revision of the upload that it was made of."""
+    """Mesh of a sample as binary STL, with the revision of its upload."""
 
     name: str
     revision: str | None
@@ -153,23 +157,23 @@ class Shape:
 
 
 class Shapes:
-    """The last shape asked for; kept until another sample's is."""
+    """Cache of the last requested shape."""
 
     def __init__(self, limit: int = MAX_BYTES) -> None:
         self._limit = limit
         self._kept: Shape | None = None
 
     def known(self, name: str, revision: str | None) -> Shape | None:
-        """The shape that was asked for last, if it is this one."""
+        """Return the last requested shape if it is this one, else None."""
         kept = self._kept
         same = kept is not None and (kept.name, kept.revision) == (name, revision)
         return kept if same else None
 
     def of(self, name: str, revision: str | None, phantom: Phantom) -> Shape:
-        """The shape of `phantom`; it may take a second.
+        """Compute the shape of `phantom`, or return it from the cache; may take a second.
 
         Raises:
-            RpcError: -32008, more triangles than are sent.
+            RpcError: -32008, it has more triangles than may be sent.
         """
         if (kept := self.known(name, revision)) is not None:
             return kept
@@ -183,7 +187,7 @@ class Shapes:
 
 @dataclass(frozen=True)
 class Way:
-    """What a planned move does: legs in order, seconds in all, and why it is no direct move."""
+    """A planned move: consecutive legs, total time [s], and why it is not a direct move."""
 
     legs: tuple[Mapping[str, float], ...]
     duration_s: float
@@ -207,7 +211,7 @@ class ObstacleMoves:
     _commands: int = 0
 
     def cancel(self) -> None:
-        """Another command has come: no further leg starts, and no way that is being planned."""
+        """Stop planning and start no further leg, because of another command."""
         self._commands += 1
         if self._task is not None:
             self._task.cancel()
@@ -216,7 +220,7 @@ class ObstacleMoves:
     async def plan(
         self, targets: Mapping[str, float], *, relative: bool = False, shortest: bool = False
     ) -> Way:
-        """A free way from where the motors will rest.
+        """Plan a free way from where the motors will rest.
 
         Raises:
             UnknownNameError, LimitError, SafetyError: as a move.
@@ -233,6 +237,7 @@ class ObstacleMoves:
         return way
 
     async def _plan(self, targets: Mapping[str, float], *, relative: bool, shortest: bool) -> Way:
+        """Resolve targets and find a free way; see `plan`."""
         scanner = self.scanner
         require_ready(scanner.safety, "motion")
         goal = scanner.resolve(targets, self.clock.now(), relative=relative, shortest=shortest)
@@ -268,9 +273,14 @@ class ObstacleMoves:
         return self._task
 
     async def _legs(self, way: Way) -> None:
+        """Execute the legs of a way one by one.
+
+        Raises:
+            SafetyError: other motion has begun or motion was stopped.
+        """
         scanner, clock = self.scanner, self.clock
         mine: int | None = None
-        """The programme of the last leg; another one is somebody else's."""
+        """Number of the last leg's programme, to detect other motion."""
         for leg in way.legs:
             await clock.at_rest(scanner.rest_time)
             if mine is not None and scanner.programmes != mine:
@@ -286,6 +296,7 @@ class ObstacleMoves:
     def _way(
         self, start: Mapping[str, float], legs: Sequence[Mapping[str, float]], *warnings: str
     ) -> Way:
+        """Make the `Way` of legs from `start` with its total time."""
         seconds, here = 0.0, dict(start)
         for leg in legs:
             moves = {axis: (here[axis], 0.0, value) for axis, value in leg.items()}
@@ -296,7 +307,7 @@ class ObstacleMoves:
 
 
 async def finished(task: asyncio.Task[None]) -> list[str]:
-    """Wait for a way to be gone; what ended it early, as warnings."""
+    """Wait for the end of a way; returns warnings if it ended early."""
     await asyncio.wait([task])
     if task.cancelled():
         return ["another command ended the way before its last leg"]

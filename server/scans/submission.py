@@ -54,15 +54,15 @@ from flexdt.twin.script.planning.sample_findings import (
 )
 
 RESERVED = ("corrections", FOLDER, "samples")
-"""Folders of the data directory that are no data sets."""
+"""Folders of the data directory that are not data sets."""
 PREDICTION_PATIENCE_S: Final = 1.0
-"""How long a submission waits for a projector that is busy before it goes on without a prediction
-of the sample."""
+"""Longest wait of a submission for a busy projector, before it continues without a
+prediction of the sample [s]."""
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """What the counts of a scan's projections will be.
+    """Predicted counts of a scan's projections.
 
     Attributes:
         exposures: of each setting of tube and camera, for the data set.
@@ -75,7 +75,7 @@ class Prediction:
 
 @dataclass(eq=False, repr=False)
 class Submissions:
-    """Makes jobs.
+    """Checks scans and makes jobs of them.
 
     Attributes:
         scanner, jobs, stage: see their modules.
@@ -107,15 +107,16 @@ class Submissions:
     _predicting: set[asyncio.Task[list[CountShares | None]]] = field(
         default_factory=set, init=False
     )
-    """Predictions under way."""
+    """Running predictions."""
     _numbered: tuple[str, int] = field(default=("", 1), init=False)
-    """A day, and the number of its scan that was named last."""
+    """Day, and number of the last scan named on it."""
 
     async def check(self, wish: ScanSource, codec: Codec) -> Encoded:
-        """The dry-run report from where the scanner stands; nothing moves.
+        """Compute the dry-run report from the scanner's present state; nothing moves.
 
         Raises:
-            RpcError: -32008, it takes too long, too much memory, or is too large for an answer.
+            RpcError: -32008, it takes too long, too much memory, or is too large for an
+                answer.
         """
         matter = await self._matter(wish, self.start(), self.scanner.sample)
         return Encoded(tuple(await self.checks.report(matter, codec)))
@@ -168,10 +169,10 @@ class Submissions:
         )  # fmt: skip
 
     async def again(self, job: Job, ensure_allowed: Callable[[], None] = lambda: None) -> None:
-        """Put a job that ended early in the queue once more; only missing images are made.
+        """Put a job that ended early into the queue again; only missing images are made.
 
         Raises:
-            RpcError: as `submit`; -32602 where there is nothing to go on from.
+            RpcError: as `submit`; -32602 if there is nothing to continue.
         """
         name, refused = job.name, partial(name_conflict, job.name)
         if self.jobs.uses(job.folder):
@@ -201,10 +202,10 @@ class Submissions:
         ensure_allowed: Callable[[], None],
         make: Callable[[], Job],
     ) -> Job:
-        """Write a job down, with what it must repeat, and then put it into the queue.
+        """Write a job's record, then put the job into the queue.
 
         Raises:
-            DatasetWriteError: it cannot be written; there is no such job.
+            DatasetWriteError: the record cannot be written; the job is not made.
         """
         drafts: list[Job] = []
 
@@ -229,7 +230,11 @@ class Submissions:
     async def _ready(
         self, asked: JobRecord, name: str, resume: bool, ensure_allowed: Callable[[], None]
     ) -> tuple[ScanPlan, Prepare, list[str]]:
-        """Check all of a scan, and say how it is begun."""
+        """Check a scan completely and prepare its start.
+
+        Returns:
+            the plan, a function that makes the job's inputs at its turn, and warnings.
+        """
         begin = asked.begin
         checked = await self.checks.sound(await self._matter(asked.wish, begin.start, begin.sample))
         self._ensure_same(begin)
@@ -247,6 +252,7 @@ class Submissions:
         ensure_allowed()
 
         async def prepare() -> JobInputs:
+            """Check the scan again at its turn, and open its data set."""
             begun = asked
             if not resume:  # others may have moved since, and put something else on the stage
                 begin = replace(asked.begin, start=self.start(), sample=self.scanner.sample)
@@ -284,9 +290,11 @@ class Submissions:
     async def _shares(
         self, begin: StartConditions, probes: Sequence[SampleProbe]
     ) -> list[CountShares | None]:
-        """Predict the pixels of each probe; None where the projector does not tell in time.
+        """Predict the pixels of each probe; None if the projector does not answer in
+        time.
 
-        A prediction ends no submission: what is wrong with the sample, the scan itself says.
+        A failed prediction ends no submission: errors of the sample are reported by the
+        scan itself.
         """
         radiography = replace(self.radiography, physics=begin.physics, scatter=begin.scatter)
 
@@ -303,7 +311,9 @@ class Submissions:
         return task.result() if done else [None] * len(probes)
 
     async def _matter(self, wish: ScanSource, start: StartState, shown: Sample) -> CheckInput:
-        """What may collide stands on the stage; what the beam sees is `shown`."""
+        """Collect the input of a check: bodies of the sample on the stage, beam through
+        `shown`.
+        """
         scanner, stage, stands = self.scanner, self.stage, self.scanner.sample
         parameters = scanner.parameters
 
@@ -318,7 +328,7 @@ class Submissions:
         return await asyncio.to_thread(work)
 
     def start(self) -> StartState:
-        """The scanner at rest where its motors are bound."""
+        """Return the scanner's state at rest at the motors' targets."""
         s = self.scanner
         return StartState(
             positions=s.final_positions(),
@@ -338,7 +348,7 @@ class Submissions:
         resume: bool,
         predicted: tuple[PredictedExposure, ...],
     ) -> JobInputs:
-        """Make (or take up) the data set and all that runs the plan; in a worker thread."""
+        """Create (or resume) the data set and the inputs of the run; in a worker thread."""
         begin = asked.begin
         radiography = replace(self.radiography, physics=begin.physics, scatter=begin.scatter)
         noise = NoiseRecord(begin.seed, radiography.record())
@@ -386,11 +396,11 @@ class Submissions:
             )
 
     def _resumable(self, name: str, wish: ScanSource) -> StartConditions | None:
-        """What an interrupted data set of that name started from; None if there is none.
+        """Return the start conditions of an interrupted data set; None if there is none.
 
         Raises:
-            DatasetNameError: no plain name.
-            RpcError: -32602, the name is taken by something that cannot be resumed.
+            DatasetNameError: the name is not a plain one.
+            RpcError: -32602, the name is taken by a data set that cannot be resumed.
         """
         refused = partial(name_conflict, name)
         plain_name(name, "data set")
@@ -432,7 +442,7 @@ class Submissions:
         return kept.begin
 
     def _free_name(self) -> str:
-        """As the scanner names its scans: date and number."""
+        """Choose a name as the scanner does: date and number."""
         used, now = {job.name for job in self.jobs.all()}, self.now()
         if self._numbered[0] != dated_name(now, 0):
             self._numbered = dated_name(now, 0), 1
@@ -444,7 +454,7 @@ class Submissions:
         return name
 
     def _require_room(self, size: int, name: str) -> None:
-        """Refuse a scan that the disk cannot hold."""
+        """Refuse a scan that does not fit on the disk."""
         there = 0
         with suppress(FileNotFoundError), self.root.folder(name).entries() as entries:
             images = (e.stat(follow_symlinks=False) for e in entries if e.name.endswith(".tif"))
@@ -453,7 +463,7 @@ class Submissions:
 
 
 def name_conflict(name: str, why: str) -> RpcError:
-    """The error for a data set's name that cannot be used."""
+    """Make the error for a data set's name that cannot be used."""
     return invalid_params(
         f"the data set name {name!r} cannot be used: {why}",
         [problem("name", why, name)],

@@ -24,13 +24,13 @@ from flexdt.twin.errors import LimitError
 SpeedUp = float | Literal["max"]
 
 WINDOW_S = 5.0
-"""Real seconds over which the real-time factor is measured."""
+"""Interval over which the real-time factor is measured [real s]."""
 SAMPLE_S = 0.25
 LATE_S = 1e9
-"""From here on (31 years) time runs no faster than real time: its steps are 0.1 us by now, and
-motion is swept with steps of that size allowed for."""
+"""Time from which on (31 years) time runs no faster than real time [s]: its steps are
+0.1 us then, and motion is swept with an allowance for such steps."""
 PATIENCE = 3
-"""Rounds of the loop for whoever was woken to do its work before time jumps again."""
+"""Rounds of the event loop for the tasks just woken, before time jumps again."""
 
 
 def check_speed_up(value: float | str) -> SpeedUp:
@@ -74,7 +74,7 @@ class TwinClock:
 
     @property
     def speed_up(self) -> SpeedUp:
-        """Twin seconds a real second that were asked for, or "max"."""
+        """Requested twin seconds a real second, or "max"."""
         return self._speed_up
 
     def set_speed_up(self, speed_up: SpeedUp) -> None:
@@ -89,7 +89,7 @@ class TwinClock:
         self._arm()
 
     def now(self) -> float:
-        """Twin time [s]."""
+        """Return the twin time [s]."""
         now = self._time()
         wall = self._wall()
         if wall - self._samples[-1][0] >= SAMPLE_S:
@@ -98,16 +98,16 @@ class TwinClock:
 
     @property
     def real_time_factor(self) -> float | None:
-        """Twin seconds that passed in a real second over the last few, None before that."""
+        """Measured twin seconds a real second over the last few; None before that."""
         wall, now = self._wall(), self._time()
         self._sample(wall, now)
         first_wall, first = self._samples[0]
         return (now - first) / (wall - first_wall) if wall - first_wall > SAMPLE_S else None
 
     def at(self, moment: float) -> asyncio.Future[None]:
-        """A future that is done once the clock has reached `moment` [s].
+        """Return a future that is done once the clock has reached `moment` [s].
 
-        Whoever holds it may finish or cancel it early; the clock then forgets it.
+        Its owner may finish or cancel it early; the clock then drops it.
         """
         future: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         if self._time() >= moment:
@@ -129,7 +129,7 @@ class TwinClock:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Time stands still inside; holds nest."""
+        """Stop the time within the context; contexts nest."""
         self._rebase()
         self._holds += 1
         self._arm()
@@ -174,7 +174,7 @@ class TwinClock:
             self._timer = loop.call_later(min(wait, 3600.0), self._ring)
 
     def _jump(self, patience: int) -> None:
-        """As fast as may: go to the first moment somebody waits for, and wake that one alone."""
+        """Jump to the first awaited time, and wake its task alone; for speed "max"."""
         if patience > 0:
             self._timer = asyncio.get_running_loop().call_soon(self._jump, patience - 1)
             return
@@ -188,7 +188,7 @@ class TwinClock:
         self._arm()
 
     def _ring(self) -> None:
-        """Time flows: wake whoever is due."""
+        """Wake the tasks that are due while time flows."""
         self._timer = None
         now = self._time()
         # The loop's timer may fire a hair early; what is due within a microsecond is due.

@@ -30,7 +30,7 @@ from flexdt.twin.scanner.state import SafetyName
 
 
 class TwinSession:
-    """One connection to the twin."""
+    """One client connection to the twin."""
 
     def __init__(self, twin: TwinServer, peer: Peer) -> None:
         self._twin = twin
@@ -60,7 +60,7 @@ class TwinSession:
             raise
 
     def close(self) -> None:
-        """The connection has ended: no more events, and control is free again."""
+        """Unsubscribe the ended connection, release its control and cancel its way."""
         if self._twin.control.holder == self._client.name:
             self._twin.detours.cancel()  # what the controller planned ends with the present leg
         self._twin.hub.drop(self._client.peer)
@@ -80,7 +80,7 @@ def twin_pages(
     projector: ProjectorPool,
     requests: Requests,
 ) -> Pages:
-    """The pages of a twin server that runs."""
+    """Make the web pages of a running twin server."""
 
     def health() -> dict[str, object]:
         job = twin.jobs.current
@@ -96,6 +96,7 @@ def twin_pages(
 
 
 def _figures(twin: TwinServer, server: TcpServer, projector: ProjectorPool) -> list[Metric]:
+    """List the metrics of the twin server."""
     jobs = Counter(job.phase for job in twin.jobs.all())
     phases: dict[str, float] = {phase: jobs[phase] for phase in get_args(JobPhase)}
     events: dict[str, float] = {topic: twin.hub.count(topic) for topic in get_args(TopicName)}

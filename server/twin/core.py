@@ -58,9 +58,9 @@ from flexdt.twin.scanner.state import NamedCorrection, Sample, ScannerState, Tub
 from flexdt.twin.script import Exposure
 
 LOG_KEPT = 50
-"""Entries of the topic `log` that a late subscriber gets."""
+"""Number of entries of the topic `log` that a late subscriber gets."""
 FAILURES, FAILURES_S = 5, 60.0
-"""A service that has failed so often within so many real seconds cannot be kept going."""
+"""Number of failures, within a time [real s], after which a service is not restarted."""
 SERVICE_PAUSE_S = 0.1
 
 
@@ -87,7 +87,7 @@ class ControlLease:
         self._heard = clock()
 
     def heard(self, who: str) -> None:
-        """`who` has asked for something: its lease runs anew."""
+        """Renew the lease of `who` after a request."""
         if who == self.holder:
             self._heard = self._clock()
 
@@ -174,7 +174,7 @@ class TwinServer:
         self.limits = TwinLimits() if limits is None else limits
         self.version = version("flexdt")
         self.instance = secrets.token_hex(8)
-        """Names this run of the server."""
+        """Random name of this run of the server."""
         machine = with_spectra(machine, physics)
         self.machine, self.profile = machine, profile
         self.directory, self.root = root, root.path
@@ -203,7 +203,7 @@ class TwinServer:
         )
         self._apply_last()
         self.stage_turn = asyncio.Lock()
-        """Held while the stage is changed: such changes come one after the other."""
+        """Held while the stage is changed, so that changes are made one by one."""
         self.stage = Stage(machine, profile, self.samples)
         self.detours = ObstacleMoves(self.scanner, self.clock, self.stage, self.changed)
         self.imaging = Imaging(
@@ -228,7 +228,7 @@ class TwinServer:
         self.keeper = kept.StateStore(root, self._memory, self.job_files, self.jobs.changed)
         self.keeper.noticed = self._noticed_disk
         self._unfiled: list[JobMemory] = []
-        """Jobs that an earlier server kept in its state, as long as they have no files."""
+        """Jobs that an earlier server kept in its state and that have no files."""
         self._recalled = False
         self.submissions = Submissions(
             self.scanner,
@@ -249,13 +249,15 @@ class TwinServer:
             projector_watch.asks = lambda: self.hub.wanted("state")
             projector_watch.changed = self.feed.changed
         self.failed = asyncio.Event()
-        """Set when a part of the twin has died; the process should end."""
+        """Set when a part of the twin has failed for good; the process should end."""
         self._tasks: list[asyncio.Task[None]] = []
         self._awaited: set[asyncio.Future[None]] = set()
-        """Ends of motions that somebody waits for."""
+        """Awaited ends of motions."""
 
     async def start(self, sample: Sample | None = None) -> None:
-        """Begin to work, with `sample` on the stage wherever the motors stand."""
+        """Start the services, with `sample` on the stage at the motors' present
+        positions.
+        """
         shown, correction = sample or Sample(), self.scanner.correction
         guard = await self.guard(shown, correction)
         for warning in self.scanner.initialise_stage(shown, correction, guard, self.clock.now()):
@@ -287,9 +289,9 @@ class TwinServer:
             self.keeper.end()
 
     def recall(self) -> Sample | None:
-        """Before `start`: be as the server before this one was; returns the sample it had.
+        """Restore the state of the previous server, before `start`; returns its sample.
 
-        None where nothing is remembered, or nothing that fits this machine.
+        None if nothing is stored, or nothing that fits this machine.
         """
         memory = self.remembered
         left = self._recall_jobs(memory)
@@ -307,7 +309,7 @@ class TwinServer:
         return None if sample is None else self._readable(sample)
 
     def _recall_jobs(self, memory: kept.Memory | None) -> list[Job]:
-        """Know the jobs of earlier servers; returns those that were left undone."""
+        """Restore the jobs of earlier servers; returns the unfinished ones."""
         self._recalled = True
         jobs = self.job_files.read()
         if memory is None:
@@ -324,7 +326,7 @@ class TwinServer:
         return self.jobs.recall(known, memory.jobs_made, self.directory)
 
     def _apply_last(self) -> None:
-        """At the start: the correction that was in force is, unless it cannot be."""
+        """Apply the correction of the previous server at the start, if possible."""
         last, lost = self.corrections.in_force, self.corrections.lost
         if lost is not None:
             self.tell("warning", f"the correction in force, {lost!r}, is lost: none is in force")
@@ -336,7 +338,7 @@ class TwinServer:
                       reason=str(error))  # fmt: skip
 
     def _readable(self, sample: Sample) -> Sample:
-        """At the start: what stood on the stage, or the empty stage where it cannot be read."""
+        """Return the stored sample, or the empty stage if the sample cannot be read."""
         head = self.samples.head(sample.name)
         if head is not None and head.kind == "voxels":
             sample = replace(sample, material=None)
@@ -349,10 +351,10 @@ class TwinServer:
         return sample
 
     async def _guarded(self, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        """Keep a service going: an exception in it is logged, and the service is restarted.
+        """Run a service; after an exception log it and restart the service.
 
-        A service that fails again and again ends the process, which its supervisor starts anew:
-        without the service the server would answer and do nothing.
+        A service that fails repeatedly ends the process, which its supervisor restarts:
+        without the service the server would answer without acting.
         """
         ends: deque[float] = deque(maxlen=FAILURES)
         while not self.failed.is_set():
@@ -369,10 +371,10 @@ class TwinServer:
     # Reading ------------------------------------------------------------------------------------
 
     def state(self) -> w.State:
-        """Everything, for the wire.
+        """Compute the complete state for the wire.
 
         Raises:
-            GeometryError: the pose is none a scanner can have.
+            GeometryError: the pose is impossible for a scanner.
         """
         snapshot = self.scanner.state(self.clock.now())
         job, problem = self.jobs.current, self.keeper.problem
@@ -402,7 +404,7 @@ class TwinServer:
         return clearance(guard.scene, motors) if isinstance(guard, SceneGuard) else None
 
     def sample_state(self) -> w.SampleState:
-        """What stands on the stage, for the wire."""
+        """Describe the sample on the stage for the wire."""
         sample = self.scanner.sample
         offset = w.SamplePlacement(**asdict(sample.offset))
         phantom = self.stage.phantom(sample)
@@ -418,14 +420,14 @@ class TwinServer:
         )
 
     def correction_state(self, correction: NamedCorrection | None) -> w.Correction | None:
-        """A correction and what it came from, for the wire."""
+        """Describe a correction and its source for the wire."""
         source = None if correction is None else self.corrections.source(correction.name)
         return state_views.correction_view(correction, source)
 
     # Changing -----------------------------------------------------------------------------------
 
     def changed(self) -> None:
-        """Something was commanded: tell watchers."""
+        """Notify watchers of a command."""
         self.feed.changed()
         self.live.changed()
         self.keeper.changed()
@@ -434,11 +436,11 @@ class TwinServer:
                 end.set_result(None)
 
     def _in_use(self) -> list[Sample]:
-        """What is on the stage, or in a scan that has not ended."""
+        """List the samples on the stage and in scans that have not ended."""
         return [self.scanner.sample, *self.jobs.samples()]
 
     def _settled(self) -> None:
-        """Motion has ended."""
+        """Request a live image and the saving of the state after motion has ended."""
         self.live.changed()
         self.keeper.changed()
 
@@ -460,12 +462,12 @@ class TwinServer:
         correction: NamedCorrection | None,
         upload: ReceivedSample | None = None,
     ) -> Guard | None:
-        """What sweeps motion with a sample and a correction; `upload` as for `Stage.pieces`."""
+        """Create the guard for a sample and a correction; `upload` as for `Stage.pieces`."""
         parameters = NOMINAL if correction is None else correction.parameters
         return await asyncio.to_thread(self.stage.guard, sample, parameters, upload)
 
     async def motion_ended(self, motors: Collection[str]) -> None:
-        """Wait until `motors` have come to rest, wherever that is."""
+        """Wait until `motors` are at rest, at any position."""
         while True:
             now = self.clock.now()
             trajectories = self.scanner.trajectories(now)
@@ -480,7 +482,7 @@ class TwinServer:
                 self._awaited.discard(end)
 
     def interrupt(self, what: str) -> None:
-        """A stop from outside also pauses the scan that runs."""
+        """Pause the running scan after a stop from outside."""
         self.jobs.interrupt(SafetyError(f"{what} was commanded; resume goes on", {"asked": what}))
 
     def tell(self, level: w.LogLevel, message: str, **data: object) -> None:
@@ -503,6 +505,7 @@ class TwinServer:
         self.hub.publish("log", entry, slot=None)
 
     def _job_changed(self, job: Job) -> None:
+        """Publish and log a job's change."""
         status = self.jobs.status(job)
         self.hub.publish("job", status, slot=job.id)
         if status.state not in ("running", job.logged):
@@ -513,7 +516,7 @@ class TwinServer:
         self.changed()
 
     def _scan_image(self, frame: Exposure, radiograph: Radiograph) -> None:
-        """Watchers see what the scan has just made, in public geometry."""
+        """Publish the scan's latest image, with its public geometry."""
         wanted = self.hub.wanted("projection")
         if not wanted and frame.kind != "projection":
             return

@@ -22,23 +22,23 @@ from flexdt.protocol.rpc_errors import busy
 from flexdt.server.network.shell_parts import Peer
 
 A_TURN = 4
-"""Events posted in one turn of the loop; requests are read and answered between turns."""
+"""Events posted in one turn of the event loop; requests are handled between turns."""
 
 
 @dataclass(frozen=True)
 class ImageWish:
-    """How a subscriber wants images: kind, and the mean over binning x binning pixels."""
+    """A subscriber's view of images: kind, and the mean over binning x binning pixels."""
 
     kind: Literal["line_integral", "counts"] = "line_integral"
     binning: int = 1
 
 
 Render = Callable[[ImageWish], object]
-"""Makes an event's data for one view; called at most once a view."""
+"""Computes an event's data for one view; called at most once a view."""
 
 
 class _Event:
-    """One event, encoded once a view and codec."""
+    """One event with its encodings, one a view and codec."""
 
     def __init__(
         self, topic: TopicName, seq: int, time: float, data: object | Render, slot: str | None
@@ -56,7 +56,7 @@ class _Event:
 
 @dataclass
 class _Subscription:
-    """One topic of one listener."""
+    """One listener's subscription to a topic."""
 
     view: ImageWish
     min_interval_s: float
@@ -66,13 +66,15 @@ class _Subscription:
 
 
 class Hub:
-    """Topics and their subscribers.
+    """Topics with their subscribers.
 
     Args:
         now: twin time [s], stamped on every event.
-        kept: topic -> how many of its last events late subscribers get; they are plain data.
+        kept: topic -> how many of its last events late subscribers get; they are plain
+            data.
         most: subscriptions, one for each topic of each listener.
-        most_views: different views, each of which costs a rendering and an encoding an event.
+        most_views: different views, each of which costs a rendering and an encoding an
+            event.
     """
 
     def __init__(
@@ -120,6 +122,7 @@ class Hub:
                     self._deliver(listener, subscription, earlier)
 
     def _require_room(self, listener: Peer, topics: set[TopicName], view: ImageWish) -> None:
+        """Refuse subscriptions and views beyond the limits."""
         views = [
             s.view
             for topic, listeners in self._listeners.items()
@@ -148,11 +151,11 @@ class Hub:
             self._told.pop((listener, topic), None)
 
     def wanted(self, topic: TopicName) -> bool:
-        """Whether anybody is subscribed, so that nothing is computed in vain."""
+        """Return whether a topic has subscribers, so that nothing is computed in vain."""
         return bool(self._listeners.get(topic))
 
     def count(self, topic: TopicName) -> int:
-        """How many events of `topic` there have been."""
+        """Return the number of events of `topic` so far."""
         return self._seq.get(topic, 0)
 
     def views(self, topic: TopicName) -> set[ImageWish]:
@@ -203,6 +206,7 @@ class Hub:
             self._deliver(listener, subscription, _Event(topic, seq, self._now(), data, slot))
 
     def _offer(self, listener: Peer, subscription: _Subscription, new: _Event) -> None:
+        """Deliver an event now, or keep it until the subscription's rate allows it."""
         loop = asyncio.get_running_loop()
         wait = subscription.next_at - loop.time()
         if new.slot is not None and (wait > 0.0 or subscription.timer is not None):
@@ -221,12 +225,12 @@ class Hub:
             self._deliver(listener, subscription, newest)
 
     def _deliver(self, listener: Peer, subscription: _Subscription, new: _Event) -> None:
-        """Post an event at once, or in its turn when many are due."""
+        """Post an event at once, or in order if many are due."""
         self._due.append((listener, subscription, new))
         self._drain()
 
     def _drain(self) -> None:
-        """Post what this turn of the loop has room for."""
+        """Post as many events as one turn of the loop allows."""
         while self._due and self._room:
             listener, subscription, new = self._due.popleft()
             if self._listeners.get(new.topic, {}).get(listener) is subscription:

@@ -34,14 +34,14 @@ from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.scanner.state import NamedCorrection, Sample, TubeSettings
 
 FRAME_INTERVAL_S = 0.04
-"""Real seconds between live projections, at least."""
+"""Least interval between live projections [real s]."""
 STATE_INTERVAL_S = 0.025
 RETRY_S = 1.0
 
 
 @dataclass(frozen=True)
 class Shot:
-    """Everything a live image depends on, at one moment."""
+    """The state on which a live image depends."""
 
     time: float
     positions: tuple[tuple[str, float], ...]
@@ -50,11 +50,13 @@ class Shot:
     tube: TubeSettings
     correction: NamedCorrection | None
     revision: str | None = None
-    """Names the content of an uploaded sample."""
+    """Identifies the content of an uploaded sample."""
 
     @classmethod
     def of(cls, scanner: ScannerTwin, now: float, revision: str | None = None) -> Shot:
-        """The scanner at `now`, with the revision of the sample on its stage."""
+        """Read the scanner's state at `now`, with the revision of the sample on its
+        stage.
+        """
         return cls(
             time=now,
             positions=tuple(sorted(scanner.positions(now).items())),
@@ -67,7 +69,7 @@ class Shot:
 
     @property
     def origin(self) -> ImageOrigin:
-        """What an image of it is made of, for the wire."""
+        """Description of the origin of an image, for the wire."""
         sample, tube, camera = self.sample, self.tube, self.camera
         return ImageOrigin(
             sample=sample.name or None,
@@ -86,19 +88,19 @@ class Shot:
 
     @property
     def lit(self) -> bool:
-        """Whether X-rays reach the panel: on, and warmed up."""
+        """True if X-rays reach the panel: on, and warmed up."""
         return self.tube.ready(self.time)
 
     @property
     def exposure(self) -> ExposureSettings:
-        """Tube and camera."""
+        """Settings of tube and camera."""
         camera, tube = self.camera, self.tube
         return ExposureSettings(
             tube.kV, tube.power_W, camera.exposure_ms, camera.averages, self.lit
         )
 
     def same_image(self, other: Shot | None) -> bool:
-        """Whether the other one's image is this one's, whatever the time."""
+        """Return whether another shot has the same image, whatever the time."""
         return (
             other is not None
             and self.lit == other.lit
@@ -114,15 +116,15 @@ def image_of(
     radiography: Radiography,
     rng: np.random.Generator | None,
 ) -> Projection:
-    """One image as the wire has it.
+    """Convert an image to its wire form.
 
     Args:
         radiograph: the image without noise.
         cone: nominal geometry plus correction, n = 1, of the unbinned image.
         shot: pose, tube and camera.
         view: kind and binning; at least one pixel is left.
-        radiography: how images are made.
-        rng: noise of counts; None for none.
+        radiography: model of the images.
+        rng: noise of counts; None for no noise.
     """
     integrals = radiograph.shown
     factor = min(view.binning, *integrals.shape)
@@ -148,14 +150,14 @@ def image_of(
 
 @dataclass(eq=False, repr=False)
 class LiveView:
-    """Publishes the topic `projection` while nobody scans.
+    """Publishes the topic `projection` while no scan runs.
 
     Attributes:
         scanner, clock, hub, radiography: see their modules.
         quiet: whether a scan is making the images now (then this stays silent).
         revision: names the content of an uploaded sample.
-        turn: held while an image is made in a thread: the loop waits for one interpreter lock, not
-            for those of a crowd.
+        turn: held while an image is made in a thread: the loop waits for one interpreter
+            lock, not for those of a crowd.
     """
 
     scanner: ScannerTwin
@@ -175,13 +177,15 @@ class LiveView:
         self._showing: asyncio.Task[None] | None = None
 
     def changed(self, *, again: bool = False) -> None:
-        """Something an image depends on may have changed; `again`: somebody new listens."""
+        """Request a new image after a change; `again` publishes it even if it is the
+        same.
+        """
         if again:
             self._last = None
         self._changed.set()
 
     def now(self) -> Shot:
-        """What an image of this moment depends on."""
+        """Return the present shot."""
         scanner = self.scanner
         return Shot.of(scanner, self.clock.now(), self.revision(scanner.sample))
 
@@ -208,7 +212,12 @@ class LiveView:
                 await asyncio.sleep(max(0.0, begun + FRAME_INTERVAL_S - loop.time()))
 
     async def shoot(self, shot: Shot, *, predicted: bool = False) -> tuple[Radiograph, ConeVec]:
-        """The image of a shot, and its public geometry; `predicted`: of that geometry alone."""
+        """Compute the image of a shot and its public geometry.
+
+        Args:
+            shot: pose, tube and camera.
+            predicted: use the public geometry for the image as well.
+        """
         scanner = self.scanner
         poses = scanner.poses_at(dict(shot.positions), shot.camera)
         cone = scanner.corrected(poses, shot.camera, shot.correction)
@@ -227,7 +236,7 @@ class LiveView:
 
     @property
     def seen(self) -> ImageFlags | None:
-        """What is wrong with the image made last."""
+        """Flags of the last image, such as saturation."""
         if isinstance(self._seen, tuple):  # judged once, when somebody asks
             image, shot = self._seen
             self._seen = flags_of(self.radiography, image, shot.camera, shot.exposure, shot.time)
@@ -239,6 +248,7 @@ class LiveView:
         await self._publish(radiograph, cone, shot)
 
     async def _publish(self, radiograph: Radiograph, cone: ConeVec, shot: Shot) -> None:
+        """Publish an image to the subscribers in their views."""
         self._count += 1
         count, views = self._count, self.hub.views("projection")
 
@@ -281,7 +291,7 @@ class StateFeed:
     _changed: asyncio.Event = field(default_factory=asyncio.Event)
 
     def changed(self) -> None:
-        """Something of the state has changed."""
+        """Request the publication of a changed state."""
         self._changed.set()
 
     async def run(self, settled: Callable[[], None]) -> None:

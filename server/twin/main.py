@@ -19,13 +19,13 @@ from flexdt.runtime.settings import parse
 
 DEFAULT_SAMPLE = "lego"
 SWITCH_S = 0.001
-"""How long a worker thread may keep the interpreter while the event loop wants it [s]."""
+"""Longest time that a worker thread keeps the interpreter from the event loop [s]."""
 PATIENCE_S = 10.0
-"""How long the projector may be away before a scan pauses [s]."""
+"""Longest absence of the projector before a scan pauses [s]."""
 
 
 async def run(options: TwinSettings) -> int:
-    """Serve until SIGTERM or SIGINT; returns the exit code."""
+    """Run the server until SIGTERM or SIGINT; returns the exit code."""
     from flexdt.runtime.files.directory import memory_bytes, open_data
     from flexdt.runtime.files.own_documents import lock_folder
 

@@ -21,19 +21,19 @@ from flexdt.server.network.shell_parts import Call, Frozen
 from flexdt.server.scans.scan_record import PoseList
 
 MAX_PARAMS: Final = 1 << 20
-"""Bytes of a call's parameters, unless its method says that they may be `bulky`."""
+"""Largest size of a call's parameters, except for methods marked `bulky` [bytes]."""
 MEMORY_BYTES: Final = 3 << 30
 SECONDS: Final = 60.0
 
 
 class Reader:
-    """Reads messages apart; `close` it in the end."""
+    """Reads messages in a worker; `close` must be called at the end."""
 
     def __init__(self) -> None:
         self._workers = Workers(1, MEMORY_BYTES, SECONDS)
 
     async def __call__(self, raw: bytes, wire: Connection) -> Frozen | tuple[Frozen, ...]:
-        """The message of `raw`, or those of a batch.
+        """Decode the message of `raw`, or those of a batch.
 
         Raises:
             RpcError: -32008, it cannot be read within the limits.
@@ -49,7 +49,7 @@ class Reader:
 
 
 def work(codec: Codec | None, most: int, raw: bytes) -> list[bytes]:
-    """In the worker: the items of a message, of a batch of at most so many: method, pickle."""
+    """Decode in the worker: returns method and pickle of each item of a message or batch."""
     message = Connection(codec, max_batch=most).decode(raw)
     batch = isinstance(message, m.Batch)
     items = message.items if isinstance(message, m.Batch) else (message,)
@@ -61,6 +61,9 @@ def work(codec: Codec | None, most: int, raw: bytes) -> list[bytes]:
 
 
 def _frozen(message: m.Single) -> bytes:
+    """Pickle a message as a call with its parameters read; too large ones become an
+    error.
+    """
     if not isinstance(message, m.Request | m.Notification):
         return pickle.dumps(message)
     answered = isinstance(message, m.Request)
@@ -75,6 +78,9 @@ def _frozen(message: m.Single) -> bytes:
 
 
 def _params(message: m.Request | m.Notification) -> Params | RpcError:
+    """Read a call's parameters as its method's model; returns the error if they do not
+    fit.
+    """
     try:
         params = parse_params(find(message.method), message.params)
     except RpcError as error:

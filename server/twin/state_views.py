@@ -15,11 +15,11 @@ from flexdt.twin.scanner.joining import StopMotion
 from flexdt.twin.scanner.state import NamedCorrection, Readout, Safety, TubeSettings
 
 SAFETY_NAMES = {"ready": "ok", "blocked": "aborted", "estopped": "estop"}
-"""The twin's safety states as the wire names them."""
+"""The twin's safety states -> their names on the wire."""
 
 
 def tube_view(tube: TubeSettings, now: float) -> w.TubeState:
-    """The tube at `now`."""
+    """Convert the tube's state at `now` to its wire form."""
     return w.TubeState(
         on=tube.on,
         kV=tube.kV,
@@ -30,15 +30,15 @@ def tube_view(tube: TubeSettings, now: float) -> w.TubeState:
 
 
 def camera_view(camera: CameraSettings, machine: Machine) -> w.CameraState:
-    """The camera."""
+    """Convert the camera's state to its wire form."""
     return w.CameraState(**camera.facts(machine.detector.pixels))
 
 
 def geometry_view(readout: Readout | None) -> w.GeometryState:
-    """Derived geometry.
+    """Convert the derived geometry to its wire form.
 
     Raises:
-        GeometryError: the pose is none a scanner can have.
+        GeometryError: the pose is impossible for a scanner.
     """
     if readout is None:
         raise GeometryError(
@@ -48,7 +48,9 @@ def geometry_view(readout: Readout | None) -> w.GeometryState:
 
 
 def safety_view(safety: Safety, clearance: NearestPair | None, margin_mm: float) -> w.SafetyState:
-    """The safety state, and how close things are now: nearer than `margin_mm` is a warning."""
+    """Convert safety state and clearance to their wire form; below `margin_mm` is a
+    warning.
+    """
     near = None if clearance is None or not math.isfinite(clearance.mm) else clearance
     warnings = []
     if near is not None and near.pair is not None and near.mm < margin_mm:
@@ -67,21 +69,21 @@ def safety_view(safety: Safety, clearance: NearestPair | None, margin_mm: float)
 
 
 def correction_view(correction: NamedCorrection | None, source: str | None) -> w.Correction | None:
-    """A correction, in mm and deg."""
+    """Convert a correction to its wire form, in mm and deg."""
     if correction is None:
         return None
     return w.Correction(**correction_fields(correction), source=source)
 
 
 def clock_view(clock: TwinClock) -> w.ClockState:
-    """The clock."""
+    """Convert the clock's state to its wire form."""
     return w.ClockState(
         time_s=clock.now(), speed_up=clock.speed_up, real_time_factor=clock.real_time_factor
     )
 
 
 def stopped_view(state: w.State, stopping: StopMotion, now: float) -> w.Stopped:
-    """The state after a stop, and how the motors come to rest."""
+    """Return the wire state after a stop, with the motors' stopping motion."""
     hit = stopping.would_hit
     how = w.Stopping(
         path=stopping.path,

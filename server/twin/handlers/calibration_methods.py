@@ -18,7 +18,7 @@ from flexdt.server.twin.handlers import handler as h
 async def apply(
     twin: TwinServer, client: h.Client, params: p.CalibrationApply
 ) -> p.CorrectionResult:
-    """A new correction in force, instead of the last."""
+    """Apply a new correction instead of the last one."""
     async with twin.stage_turn:
         correction = twin.corrections.make(params.parameters, params.name, params.comment)
         history = twin.corrections.after(correction)
@@ -31,7 +31,7 @@ async def apply(
 
 @h.answers(p.CALIBRATION_GET)
 def get(twin: TwinServer, client: h.Client, params: p.CalibrationGet) -> p.CorrectionResult:
-    """The one in force, or the one named."""
+    """Return the applied correction, or the named one."""
     if params.name is None:
         return p.CorrectionResult(correction=twin.correction_state(twin.scanner.correction))
     return p.CorrectionResult(correction=twin.correction_state(twin.corrections.get(params.name)))
@@ -41,7 +41,7 @@ def get(twin: TwinServer, client: h.Client, params: p.CalibrationGet) -> p.Corre
 async def list_all(
     twin: TwinServer, client: h.Client, params: Empty
 ) -> p.CorrectionListResult | Encoded:
-    """All, oldest first."""
+    """List all corrections, oldest first."""
     current = twin.scanner.correction
     views = await h.in_turns(twin.corrections.all(), twin.correction_state)
     result = p.CorrectionListResult(
@@ -53,7 +53,7 @@ async def list_all(
 
 @h.answers(p.CALIBRATION_REVERT)
 async def revert(twin: TwinServer, client: h.Client, params: Empty) -> p.CorrectionResult:
-    """The one before, or none."""
+    """Apply the previous correction, or none."""
     async with twin.stage_turn:
         history = twin.corrections.history[:-1]
         before = twin.corrections.last(history)
@@ -66,7 +66,9 @@ async def revert(twin: TwinServer, client: h.Client, params: Empty) -> p.Correct
 async def delete(
     twin: TwinServer, client: h.Client, params: p.CalibrationDelete
 ) -> p.CorrectionDeleted:
-    """Gone from the list and from what `revert` goes back through; data sets keep theirs."""
+    """Delete a correction from the list and the history of `revert`; data sets keep
+    theirs.
+    """
     async with twin.stage_turn:
         history = twin.corrections.without(params.name)
         ready = h.ensure_allowed(twin, client, "calibration.delete")
@@ -98,7 +100,9 @@ def _in_force(twin: TwinServer, message: str, warnings: list[str]) -> p.Correcti
 
 @h.answers(DATASET_LIST, DATASET_GET, DATASET_FRAME, p.CALIBRATION_FIT, p.CALIBRATION_ALIGN)
 async def from_data_sets(twin: TwinServer, client: h.Client, params: Params) -> Encoded:
-    """What a worker process reads of the data directory."""
+    """Run a method on the data directory in a worker process and return its encoded
+    result.
+    """
     job = twin.jobs.current
     running = "" if job is None else Path(job.folder).name
     return await twin.past_scans.ask(params, running, client.peer.codec)

@@ -32,16 +32,16 @@ View = TypeVar("View")
 _P = TypeVar("_P", bound=Params)
 _R = TypeVar("_R", bound=Result)
 A_TURN = 20
-"""Items of a list that are looked at in one turn of the loop, well below a millisecond."""
+"""Items of a list processed in one turn of the loop, well below a millisecond."""
 HANDLERS: dict[str, Handler] = {}
-"""Method name -> what answers it; filled as the modules of `handlers` are imported."""
+"""Method name -> handler; filled as the modules of `handlers` are imported."""
 Answer: TypeAlias = _R | Encoded | Mapping[str, Any]
-"""A method's result: as its model, or as bytes or plain data that were made of it."""
+"""Result of a method: its model, or bytes or plain data made of it."""
 
 
 @dataclass
 class Client:
-    """One connection.
+    """One client connection.
 
     Attributes:
         peer: where events go; its name is the connection's.
@@ -53,13 +53,13 @@ class Client:
 
     @property
     def name(self) -> str:
-        """As in `controller`: what the client called itself, with the connection's number."""
+        """Name in `controller`: the client's own name with the connection's number."""
         number = self.peer.name.rpartition("#")[2]
         return f"{self.program[:40]} #{number}" if self.program else self.peer.name
 
 
 Handler = Callable[[TwinServer, Client, Any], object | Awaitable[object]]
-"""(twin, client, parameters) -> result."""
+"""Handles (twin, client, parameters) and returns the result."""
 _Handler: TypeAlias = Callable[[TwinServer, Client, _P], Answer[_R] | Awaitable[Answer[_R]]]
 
 
@@ -91,7 +91,7 @@ def ensure_idle(twin: TwinServer, client: Client, method: str, what: str) -> Cal
 
 
 async def in_turns(items: Sequence[Item], view: Callable[[Item], View]) -> list[View]:
-    """`view` of each item; other requests are answered meanwhile, however many items there are."""
+    """Apply `view` to each item; other requests are handled meanwhile."""
     views = []
     for at, item in enumerate(items, start=1):
         views.append(view(item))
@@ -101,7 +101,7 @@ async def in_turns(items: Sequence[Item], view: Callable[[Item], View]) -> list[
 
 
 async def encoded_apart(client: Client, result: _R, count: int) -> _R | Encoded:
-    """An answer of `count` items; a long one as bytes, made in a thread."""
+    """Return a result of `count` items; a long one is encoded in a thread."""
     if count <= A_TURN:
         return result
     return await asyncio.to_thread(encoded, result, client.peer.codec)
@@ -193,6 +193,12 @@ async def change_stage(
         return as_of(memory, trial, twin.corrections.in_state(names))
 
     def take() -> list[str]:
+        """Change stage, correction and settings together, and stop motion that would
+        collide.
+
+        Returns:
+            the reason for stopping as a warning, or no warning.
+        """
         ready()
         halted = scanner.take_stage(change, twin.clock.now())
         if halted is not None:  # motion that is not free of it

@@ -31,11 +31,11 @@ from flexdt.twin.scanner.state import changed_camera, changed_tube, switched
 
 @answers(p.PROJECTION_GET)
 async def get_projection(twin: TwinServer, client: Client, params: p.ProjectionGet) -> Encoded:
-    """An image at the pose of this moment, or predicted for another pose or other settings.
+    """Compute an image at the present pose, or predict one for other poses or settings.
 
     Raises:
         RpcError: -32008, it would be larger than an answer may be.
-        TwinError: a motor or a setting that the machine does not have.
+        TwinError: the machine does not have a motor or a setting.
     """
     shot = twin.live.now()
     elsewhere = any(x is not None for x in (params.positions, params.tube, params.camera))
@@ -52,7 +52,7 @@ async def get_projection(twin: TwinServer, client: Client, params: p.ProjectionG
     radiograph, cone = await twin.live.shoot(shot, predicted=elsewhere)
 
     def work() -> Encoded:
-        """Apart: an image is some megabytes."""
+        """Compute and encode in a thread, as an image has some megabytes."""
         view, way = ImageWish(params.kind, params.binning), twin.radiography
         rng = None if elsewhere else np.random.default_rng()
         made = image_of(radiograph, cone, shot, view, way, rng)
@@ -86,7 +86,7 @@ def _require_room(shape: tuple[int, int], params: p.ProjectionGet, codec: Codec)
 
 @answers(p.PROJECTION_RAY)
 async def ray(twin: TwinServer, client: Client, params: p.RayGet) -> p.RayResult:
-    """Path lengths on the ray of a pixel, in the public geometry.
+    """Compute path lengths on the ray of a pixel, in the public geometry.
 
     Raises:
         LimitError: the image has no such pixel.
@@ -104,7 +104,7 @@ async def ray(twin: TwinServer, client: Client, params: p.RayGet) -> p.RayResult
 
 @answers(p.GEOMETRY_GET)
 def get_geometry(twin: TwinServer, client: Client, params: Empty) -> w.GeometryResult:
-    """Nominal plus the correction in force."""
+    """Return the nominal geometry plus the applied correction."""
     cone = twin.scanner.cone_vec(twin.clock.now())
     return w.GeometryResult(
         cone_vec=cone.rows[0].tolist(),
@@ -115,10 +115,10 @@ def get_geometry(twin: TwinServer, client: Client, params: Empty) -> w.GeometryR
 
 @answers(p.EXPOSURE_PREDICT)
 async def predict(twin: TwinServer, client: Client, params: p.ExposurePredict) -> Encoded:
-    """Image quality of a circular scan at the distances of this moment.
+    """Predict the image quality of a circular scan at the present distances.
 
     Raises:
-        LimitError: nothing stands on the stage, or a setting is beyond the machine's.
+        LimitError: the stage is empty, or a setting is beyond the machine's limits.
     """
     sample, scanner = twin.scanner.sample, twin.scanner
     name = params.sample or sample.name

@@ -26,7 +26,7 @@ from flexdt.twin.errors import CollisionError
 
 MAX_SCRIPT_BYTES = 8 << 20
 PATIENCE_S = 2.0
-"""How long an answer waits for a job to reach the requested state."""
+"""Longest wait of an answer for a job to reach the requested state [s]."""
 ScanInput: TypeAlias = p.ScriptInput | p.TrajectoryInput
 CHECK: tuple[Method[ScanInput, p.CheckResult], ...] = (p.SCRIPT_CHECK, p.TRAJECTORY_CHECK)
 SUBMIT: tuple[Method[ScanInput, p.SubmitResult], ...] = (p.SCRIPT_SUBMIT, p.TRAJECTORY_SUBMIT)
@@ -34,13 +34,13 @@ SUBMIT: tuple[Method[ScanInput, p.SubmitResult], ...] = (p.SCRIPT_SUBMIT, p.TRAJ
 
 @h.answers(*CHECK)
 async def check(twin: TwinServer, client: h.Client, params: ScanInput) -> Encoded:
-    """The dry-run report; nothing moves."""
+    """Compute the dry-run report; nothing moves."""
     return await twin.submissions.check(_source(params), client.peer.codec)
 
 
 @h.answers(*SUBMIT)
 async def submit(twin: TwinServer, client: h.Client, params: ScanInput) -> p.SubmitResult:
-    """A script as a job, or poses, one image each."""
+    """Put a scan into the queue: a script, or poses with one image each."""
     ready = h.ensure_allowed(twin, client, "a scan")
     job = await twin.submissions.submit(
         _source(params), params.name, params.speed_up, client.program, ready
@@ -50,13 +50,13 @@ async def submit(twin: TwinServer, client: h.Client, params: ScanInput) -> p.Sub
 
 @h.answers(p.JOB_STATUS)
 def status(twin: TwinServer, client: h.Client, params: p.JobRef) -> w.JobStatus:
-    """How far a job is."""
+    """Return the progress of a job."""
     return twin.jobs.status(twin.jobs.get(params.job))
 
 
 @h.answers(p.JOB_PAUSE)
 async def pause(twin: TwinServer, client: h.Client, params: p.JobRef) -> w.JobStatus:
-    """Motion stops; frames in the making are finished."""
+    """Pause a job: motion stops, and frames being made are finished."""
     job = twin.jobs.get(params.job)
     twin.jobs.pause(job)
     return await _when(twin, job, lambda: job.phase != "running")
@@ -80,7 +80,7 @@ async def resume(twin: TwinServer, client: h.Client, params: p.JobRef) -> w.JobS
 
 @h.answers(p.JOB_STEP)
 async def step(twin: TwinServer, client: h.Client, params: p.JobRef) -> w.JobStatus:
-    """One frame or command, then paused again; -32002 as for `resume`."""
+    """Run one frame or command, then pause again; -32002 as for `resume`."""
     job = twin.jobs.get(params.job)
     twin.jobs.step(job)
     runner = job.runner
@@ -107,14 +107,14 @@ async def abort(twin: TwinServer, client: h.Client, params: p.JobAbort) -> w.Job
 
 @h.answers(p.JOB_LIST)
 async def list_jobs(twin: TwinServer, client: h.Client, params: Empty) -> p.JobListResult | Encoded:
-    """All jobs, oldest first."""
+    """List all jobs, oldest first."""
     jobs = await h.in_turns(twin.jobs.all(), twin.jobs.status)
     return await h.encoded_apart(client, p.JobListResult(jobs=jobs), len(jobs))
 
 
 @h.answers(p.JOB_FORGET)
 async def forget(twin: TwinServer, client: h.Client, params: p.JobForget) -> p.JobForgetResult:
-    """Ended jobs are not listed any more; what is incomplete goes on if it is submitted again."""
+    """Remove ended jobs from the list; an incomplete one is resumed if submitted again."""
     jobs = twin.jobs.ended(params.job, timedelta(days=params.days or 0.0))
 
     def files(changes: Changes) -> None:
@@ -134,7 +134,7 @@ async def forget(twin: TwinServer, client: h.Client, params: p.JobForget) -> p.J
 
 
 async def _when(twin: TwinServer, job: Job, condition: Callable[[], bool]) -> w.JobStatus:
-    """The status once `condition` holds, or after a while in any case."""
+    """Return the status once `condition` holds, or after PATIENCE_S in any case."""
     loop = asyncio.get_running_loop()
     deadline = loop.time() + PATIENCE_S
     while not condition() and loop.time() < deadline:
@@ -143,7 +143,7 @@ async def _when(twin: TwinServer, job: Job, condition: Callable[[], bool]) -> w.
 
 
 def _unless_obstructed(job: Job, status: w.JobStatus) -> w.JobStatus:
-    """The status of a job that is to go on, unless an obstacle is in its path."""
+    """Return the status of a job that is to continue, or raise if an obstacle blocks it."""
     error = job.runner.progress.error if job.runner is not None else None
     if status.state == "paused" and isinstance(error, CollisionError):
         raise error
@@ -151,6 +151,7 @@ def _unless_obstructed(job: Job, status: w.JobStatus) -> w.JobStatus:
 
 
 def _source(params: ScanInput) -> ScanSource:
+    """Make the requested scan from a script or poses."""
     if isinstance(params, p.TrajectoryInput):
         return ScanSource.of_poses(
             params.poses, params.exposure_ms, params.motion_samples, params.seed, params.flat

@@ -21,7 +21,7 @@ from flexdt.twin.scanner.state import CameraChange
 
 @answers(p.AXES_MOVE)
 async def move(twin: TwinServer, client: Client, params: p.Move) -> p.MoveResult:
-    """The answer goes at once, or with `wait` when the motors rest."""
+    """Start a move; the answer is sent at once, or with `wait` when the motors rest."""
     if params.plan:
         return await _move_around_obstacles(twin, client, params)
     now = twin.clock.now()
@@ -52,7 +52,10 @@ async def _unreached_targets(twin: TwinServer, wanted: Mapping[str, float]) -> l
 
 @contextmanager
 def _cancelling_detour(twin: TwinServer) -> Iterator[None]:
-    """What is accepted or halts the motors ends a way around; a refusal lets it go on."""
+    """Cancel a way around obstacles if the command is accepted or halts the motors.
+
+    A refused command leaves the way running.
+    """
     before = twin.scanner.programmes
     refused = True
     try:
@@ -65,7 +68,7 @@ def _cancelling_detour(twin: TwinServer) -> Iterator[None]:
 
 
 async def _move_around_obstacles(twin: TwinServer, client: Client, params: p.Move) -> p.MoveResult:
-    """One free move after the other; an earlier way ends with its present leg."""
+    """Start free moves one by one; an earlier way ends with its present leg."""
     twin.detours.cancel()
     now = twin.clock.now()
     told = twin.scanner.told_of(params.targets, now, relative=params.relative)
@@ -99,7 +102,7 @@ def jog(twin: TwinServer, client: Client, params: p.Jog) -> p.MoveResult:
 
 @answers(p.AXES_SET)
 async def set_axis(twin: TwinServer, client: Client, params: p.AxisSet) -> p.AxisSetResult:
-    """Speed and acceleration of motions to come."""
+    """Set speed and acceleration of future motions."""
 
     def change(scanner: ScannerTwin) -> None:
         scanner.set_axis(params.axis, speed=params.speed, acceleration=params.acceleration)
@@ -142,7 +145,7 @@ def reset(twin: TwinServer, client: Client, params: p.Reset) -> w.State:
 
 @answers(p.CLOCK_SET)
 def set_clock(twin: TwinServer, client: Client, params: p.ClockSet) -> w.ClockState:
-    """How fast twin time runs."""
+    """Set the speed of twin time."""
     twin.clock.set_speed_up(params.speed_up)
     twin.changed()
     return state_views.clock_view(twin.clock)
@@ -183,7 +186,7 @@ async def set_camera(twin: TwinServer, client: Client, params: p.CameraSet) -> w
 
 
 def camera_change(params: p.CameraSet) -> CameraChange:
-    """What to change, as the twin has it."""
+    """Convert the parameters to the twin's form."""
     roi = None if params.roi is None else Roi(*params.roi)
     change: CameraChange = {**params.model_dump(), "roi": roi}  # type: ignore[typeddict-item]
     return change

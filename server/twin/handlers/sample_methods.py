@@ -18,7 +18,7 @@ from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.scanner.state import Sample, StagePlacement
 
 NAMED = 50
-"""Uploads that an error lists, the newest."""
+"""Number of the newest uploads that an error lists."""
 
 
 @h.answers(p.SAMPLE_SET)
@@ -49,7 +49,7 @@ async def set_sample(twin: TwinServer, client: h.Client, params: p.SampleSet) ->
 async def list_samples(
     twin: TwinServer, client: h.Client, params: Empty
 ) -> p.SampleListResult | Encoded:
-    """Everything that may stand on the stage."""
+    """List everything that may be put on the stage."""
     empty = p.SampleInfo(name=EMPTY, description="nothing on the stage", size_mm=(0.0, 0.0, 0.0))
     shipped = await h.in_turns(phantom_names(), lambda name: _info(name, load_phantom(name)))
     heads = [head for name in twin.samples.uploads if (head := twin.samples.head(name)) is not None]
@@ -61,7 +61,7 @@ async def list_samples(
 
 @h.answers(p.SAMPLE_MESH)
 async def mesh(twin: TwinServer, client: h.Client, params: p.SampleMesh) -> p.SampleMeshResult:
-    """A part of the mesh of the sample on the stage, for drawing."""
+    """Send a part of the mesh of the sample on the stage, for drawing."""
     sample = twin.scanner.sample
     if not sample.name:
         raise LimitError("nothing stands on the stage", {"asked": "sample.mesh"})
@@ -83,7 +83,7 @@ async def mesh(twin: TwinServer, client: h.Client, params: p.SampleMesh) -> p.Sa
 
 @h.answers(p.SAMPLE_UPLOAD)
 async def upload(twin: TwinServer, client: h.Client, params: p.SampleUpload) -> p.UploadResult:
-    """One chunk; the last one makes the sample."""
+    """Store one chunk of an upload; the last one completes the sample."""
     head = UploadHead.of(params)
     _ensure_idle_if_used(twin, client, head.name)
     received = await asyncio.to_thread(twin.samples.receive, head, params.start, params.data)
@@ -123,7 +123,7 @@ async def upload(twin: TwinServer, client: h.Client, params: p.SampleUpload) -> 
 async def delete(
     twin: TwinServer, client: h.Client, params: p.SampleDelete
 ) -> p.SampleDeleteResult:
-    """Refused for what stands on the stage or is in a scan that has not ended."""
+    """Delete an upload, unless it is on the stage or in a scan that has not ended."""
     name, ready = params.name, h.ensure_allowed(twin, client, "sample.delete")
     async with twin.samples.turn, twin.stage_turn:
         head = twin.samples.head(name)
@@ -143,10 +143,10 @@ async def delete(
 
 
 def _ensure_unused(twin: TwinServer, name: str) -> None:
-    """Check that a sample is needed by nothing.
+    """Check that no scan and no stage needs a sample.
 
     Raises:
-        LimitError: it stands on the stage.
+        LimitError: it is on the stage.
         RpcError: -32003, a scan of it has not ended; names the job.
     """
     if name == twin.scanner.sample.name:
@@ -184,7 +184,7 @@ def _info(name: str, phantom: Phantom, head: UploadHead | None = None) -> p.Samp
 
 
 def _upload_info(head: UploadHead) -> p.SampleInfo:
-    """An upload, without reading it."""
+    """Describe an upload without reading it."""
     what = f"{head.format} {head.kind}, {head.total} bytes"
     return p.SampleInfo(name=head.name, kind=head.kind, description=what, uploaded=True)
 

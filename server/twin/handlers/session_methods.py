@@ -21,12 +21,12 @@ from flexdt.server.twin.hub import ImageWish
 from flexdt.twin.errors import SafetyError
 
 document = cache(openrpc_document)
-"""Made once: it takes 0.1 s of the loop."""
+"""OpenRPC document, made once: it takes 0.1 s of the loop."""
 
 
 @answers(p.SESSION_HELLO)
 def hello(twin: TwinServer, client: Client, params: p.Hello) -> p.HelloResult:
-    """Greet a client whose token `network.shell_parts.TokenCheck` has found right."""
+    """Answer a client's greeting; `network.shell_parts.TokenCheck` has checked its token."""
     require_compatible(params.protocol)
     client.program = client.program or params.client  # control goes by the name
     return p.HelloResult(
@@ -42,7 +42,7 @@ def hello(twin: TwinServer, client: Client, params: p.Hello) -> p.HelloResult:
 
 @answers(p.SESSION_CONTROL)
 def control(twin: TwinServer, client: Client, params: p.Control) -> p.ControlResult:
-    """One controller at a time."""
+    """Take or release control; there is one controller at a time."""
     before = twin.control.holder
     match params.action:
         case "acquire":
@@ -62,19 +62,19 @@ def control(twin: TwinServer, client: Client, params: p.Control) -> p.ControlRes
 
 @answers(p.SESSION_PING)
 def ping(twin: TwinServer, client: Client, params: Empty) -> p.Pong:
-    """A sign of life."""
+    """Return a sign of life."""
     return p.Pong(time=twin.clock.now())
 
 
 @answers(p.STATE_GET)
 def get_state(twin: TwinServer, client: Client, params: Empty) -> w.State:
-    """Everything."""
+    """Return the complete state."""
     return twin.state()
 
 
 @answers(p.STATE_SUBSCRIBE)
 def subscribe(twin: TwinServer, client: Client, params: p.Subscribe) -> Nothing:
-    """Events from now on; the present state, image and jobs come at once."""
+    """Subscribe to events; the present state, image and jobs are sent at once."""
     view = ImageWish(params.projection_kind, params.projection_binning)
     twin.hub.subscribe(client.peer, params.topics, params.max_rate_hz, view)
     if "state" in params.topics:
@@ -90,14 +90,14 @@ def subscribe(twin: TwinServer, client: Client, params: p.Subscribe) -> Nothing:
 
 @answers(p.STATE_UNSUBSCRIBE)
 def unsubscribe(twin: TwinServer, client: Client, params: p.Unsubscribe) -> Nothing:
-    """No more of these."""
+    """End subscriptions."""
     twin.hub.unsubscribe(client.peer, params.topics)
     return Nothing()
 
 
 @answers(d.SCENE_SAVE)
 def save(twin: TwinServer, client: Client, params: d.SceneSave) -> d.SceneResult:
-    """Where motors are bound, settings, sample, correction."""
+    """Save the motors' targets, settings, sample and correction as a scene."""
     scene = save_scene(
         twin.scanner,
         twin.clock.now(),
@@ -110,7 +110,9 @@ def save(twin: TwinServer, client: Client, params: d.SceneSave) -> d.SceneResult
 
 @answers(d.SCENE_LOAD)
 async def load(twin: TwinServer, client: Client, params: d.SceneLoad) -> w.State:
-    """Checked whole first, the motion included; then all of it changes and the motors set off."""
+    """Load a scene: check all of it, the motion included, then apply it and start the
+    motors.
+    """
     scene, stops = params.document, twin.scanner.stops
     require_fit(scene, twin.scanner)
     sample = sample_of(scene)
@@ -143,5 +145,5 @@ async def load(twin: TwinServer, client: Client, params: d.SceneLoad) -> w.State
 
 @answers(d.RPC_DISCOVER)
 def discover(twin: TwinServer, client: Client, params: Empty) -> dict[str, Any]:
-    """The wire as an OpenRPC document."""
+    """Return the wire as an OpenRPC document."""
     return document()
