@@ -1,4 +1,4 @@
-"""Fits to what was measured in the scans, with what a request leaves free."""
+"""Fits to the measurements of the scans, with the free parameters of a request."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from flexdt.twin.geometry.panel import PanelModel
 from flexdt.twin.geometry.poses import Poses
 
 MEASURED = Solver(floor_px=0.3)
-"""Positions of a second measurement are never taken to be better than a third of their sigma: in
-images without noise, what is off by a thousandth of a pixel is no outlier."""
+"""Positions of a second measurement are never taken to be better than a third of their
+sigma: in images without noise, positions off by a thousandth of a pixel are no outliers."""
 AS_GOOD = 1.2
 """A fit whose residuals are at most so many times as large explains the data as well."""
 
@@ -51,7 +51,7 @@ def fit_with_loose_priors(
 
 
 def _start(state: Calibration, request: CalibrationRequest) -> list[Offsets]:
-    """Start each scan at what the identification found, as far as it is free."""
+    """Start each scan at the identified values of the free parameters."""
     out = []
     for found in state.identifications:
         values = {n: getattr(found.parameters, n) for n in SIX if n in request.free}
@@ -69,7 +69,20 @@ def fit_scans(
     strain: Strain | None = None,
     arc: bool = False,
 ) -> FitResult:
-    """Fit to the best positions there are: of the second measurement, else of the first."""
+    """Fit to the best positions: of the second measurement, else of the first.
+
+    Args:
+        state: the scans and their measurements.
+        request: the free parameters.
+        start: offsets of each scan; None: from the identification.
+        bead_tolerance_mm: prior of the beads' places; None: the request's.
+        panel: distortion to estimate; None: no distortion.
+        strain: prior of the phantom's strains; None: the usual one.
+        arc: whether an exposure lasts a part of the step.
+
+    Returns:
+        The fit; with motion, its sigmas contain the motion's uncertainty.
+    """
     tolerance = request.bead_tolerance_mm if bead_tolerance_mm is None else bead_tolerance_mm
     seen = state.measured or state.identifications
     weighed = positions_weighed(state)
@@ -114,13 +127,13 @@ def refit_scans(
     strain: Strain | None = None,
     arc: bool | None = None,
 ) -> FitResult:
-    """Fit once more with something else free: more parameters, or causes of the residuals.
+    """Fit again with more parameters free, or with causes of the residuals.
 
     Args:
-        state: the scans, and what was measured in them.
-        request: what is free otherwise.
-        fit: the last one; distortion, strain and arc that it has stay.
-        extra: parameters that are free as well.
+        state: the scans and their measurements.
+        request: the parameters free otherwise.
+        fit: the last one, whose distortion, strain and arc are kept.
+        extra: parameters that are free too.
         motion: of the scans; None: as in `state`.
         bead_tolerance_mm: prior of the beads' places; None: the request's.
         start: offsets of each scan; None: those of the last fit.
@@ -142,5 +155,7 @@ def refit_scans(
 
 
 def positions_weighed(state: Calibration) -> bool:
-    """Whether positions have sigmas of their own: those of the first measurement count alike."""
+    """Check whether positions have sigmas of their own: those of the first measurement
+    count alike.
+    """
     return bool(state.measured) or all(scan.index is not None for scan in state.scans)

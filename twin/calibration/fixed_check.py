@@ -1,4 +1,4 @@
-"""Whether what a calibration does not estimate is where the data have it."""
+"""Check whether the parameters that a calibration does not estimate agree with the data."""
 
 from __future__ import annotations
 
@@ -48,13 +48,23 @@ from flexdt.twin.calibration.request import (
 from flexdt.twin.geometry.offsets import NAMES
 
 OF_FRAME = ("dO_y", "alpha", "tau_x", "tau_z")
-"""With beads that may be anywhere, these only say in which frame of the object they are."""
+"""Gauge parameters when bead positions are free: they only choose the frame of the object."""
 
 
 def explain(
     state: Calibration, request: CalibrationRequest, fit: FitResult
 ) -> tuple[FitResult, list[Finding]]:
-    """Explain the residuals of a fit; where beads or the panel do, fit with those free."""
+    """Explain the residuals of a fit, and fit with beads or panel free where they are the
+    cause.
+
+    Args:
+        state: the scans and their measurements.
+        request: the free parameters.
+        fit: to explain.
+
+    Returns:
+        The fit to be reported, and its findings.
+    """
     weighed = positions_weighed(state)
     known = Known(
         strain_prior(state.model, request),
@@ -72,8 +82,9 @@ def explain(
 
 
 def _stated_arc(state: Calibration) -> float | None:
-    """Give the part of a step that an exposure lasts in all scans; None: they differ, or nobody
-    says it."""
+    """Return the part of a step that an exposure lasts in all scans; None: they differ,
+    or it is not stated.
+    """
     arcs = {scan.arc for scan in state.scans}
     return arcs.pop() if len(arcs) == 1 else None
 
@@ -85,18 +96,18 @@ def check_fixed(
     free_fit: FitResult,
     explained: list[Finding],
 ) -> tuple[FitResult, list[Finding]]:
-    """Fit what was asked for, if what that fixes is where the data have it.
+    """Fit the requested parameters, if the fixed ones agree with the data.
 
-    All six main parameters are free first; where the data cannot tell six apart, each is freed by
-    itself. Then the priors of what else may be off are compared with what the images say of them,
-    and widened where they are a little too narrow.
+    All six main parameters are free first; where the data do not separate six, each is
+    freed by itself. Then the priors of other offsets are compared with the images, and
+    widened where they are a little too narrow.
 
     Args:
-        state: the scans, and what was measured in them.
+        state: the scans and their measurements.
         asked: the user's request.
-        free: the same with all six main parameters free, where the data tell them apart.
+        free: the same with all six main parameters free, where the data separate them.
         free_fit: its fit.
-        explained: what explains the residuals of that.
+        explained: findings on its residuals.
 
     Returns:
         The fit with those parameters fixed that are to be, and the findings that go with it.
@@ -150,14 +161,14 @@ def _contradicted(
     fixed: Mapping[str, float],
     free: tuple[FitResult, list[Finding]],
 ) -> list[Finding] | None:
-    """Give the findings if the data contradict what is fixed, else None.
+    """Return the findings if the data contradict fixed parameters, else None.
 
     Args:
-        state: the scans, and what was measured in them.
+        state: the scans and their measurements.
         asked: the user's request.
         fit: its fit.
         fixed: main parameters that it fixes, edge units.
-        free: the fit with more parameters free, and what explains its residuals.
+        free: the fit with more parameters free, and the findings on its residuals.
     """
     trials = [free]
     if not set(fixed) <= set(free[0].values):
@@ -175,7 +186,7 @@ def _contradicted(
 def _with_usual_priors(
     state: Calibration, asked: CalibrationRequest
 ) -> tuple[CalibrationRequest, dict[str, float]]:
-    """Give what is stated as exact its usual prior.
+    """Give the parameters stated as exact their usual priors.
 
     Returns:
         The request with those priors, and the values that were exact, edge units.
@@ -203,7 +214,9 @@ def _left_by_priors(
 
 
 def _doubted(fit: FitResult, free_fit: FitResult, fixed: Mapping[str, float]) -> FitResult:
-    """Widen the intervals by what the fixed parameters would change, where the data doubt them."""
+    """Widen the intervals by the change that fixed parameters would make, where the data
+    doubt them.
+    """
     if max(held_distance(free_fit, fixed).values(), default=0.0) <= DOUBT_SIGMAS:
         return fit
     doubt = {n: free_fit.values.get(n, v) - v for n, v in fit.values.items()}
@@ -211,7 +224,9 @@ def _doubted(fit: FitResult, free_fit: FitResult, fixed: Mapping[str, float]) ->
 
 
 def _fit_with_fixed(state: Calibration, request: CalibrationRequest, fit: FitResult) -> FitResult:
-    """Fit from the geometry of another fit, what `request` fixes put back to where it is fixed."""
+    """Fit from the geometry of another fit, with the fixed parameters of `request` at
+    their values.
+    """
     fixed = from_printed_reading(request.start, request.reading)
     known = {*request.free, *priors_of(state.scans, request)}
     values = {n: getattr(fixed, n) for n in NAMES if n not in known}

@@ -35,7 +35,7 @@ class FrameState(enum.Enum):
 
 @dataclass(frozen=True, eq=False)
 class FrameSpots:
-    """What was found in one frame, and why its file cannot be used where it is there."""
+    """The spots of one frame, its state, and the fault of an unusable file."""
 
     detections: Detections
     state: FrameState
@@ -43,10 +43,13 @@ class FrameSpots:
 
 
 def without_repeats(looks: Sequence[FrameSpots]) -> tuple[FrameSpots, ...]:
-    """Looks in which a frame that shows exactly what the one before shows is not used.
+    """Mark frames that repeat the frame before as unused.
 
-    Noise never repeats: such a frame is a copy, of a camera that stuttered. Where most frames are
-    (images without noise of an object that stands still) it is not that, and nothing is changed.
+    Noise never repeats: such a frame is a copy, of a camera that stuttered. Where most
+    frames repeat (images without noise of an object at rest) nothing is changed.
+
+    Args:
+        looks: spots of each frame.
     """
     out = list(looks)
     for i in range(1, len(out)):
@@ -75,7 +78,7 @@ class Frames(Protocol):
 
 
 def nothing(shape: tuple[int, int]) -> Detections:
-    """Detections of a frame without any."""
+    """Return the detections of a frame without spots."""
     return Detections.of_points(np.zeros((0, 2)), 0.0, 0.0, shape)
 
 
@@ -89,7 +92,7 @@ def look_at(image: Float32Array, detector: SpotFinder) -> FrameSpots:
 
 @dataclass(frozen=True, eq=False)
 class ArrayFrames:
-    """Line-integral images in memory; None stands for a missing frame.
+    """Line-integral images in memory; None for a missing frame.
 
     Attributes:
         images: (rows, cols) float32 each.
@@ -103,7 +106,7 @@ class ArrayFrames:
         return len(self.images)
 
     def look(self, detector: SpotFinder) -> list[FrameSpots]:
-        """See `Frames`."""
+        """Detect the beads of every frame, as `Frames` declares."""
         return [
             FrameSpots(nothing(self.shape), FrameState.MISSING)
             if image is None
@@ -112,7 +115,7 @@ class ArrayFrames:
         ]
 
     def windows(self, plan: Windows) -> Float32Array:
-        """See `Frames`."""
+        """Cut the windows of every frame, as `Frames` declares."""
         n, k = plan.corner.shape[:2]
         out = np.full((n, k, plan.side, plan.side), np.nan, dtype=np.float32)
         for i, image in enumerate(self.images):
@@ -123,11 +126,11 @@ class ArrayFrames:
 
 @dataclass(frozen=True, eq=False)
 class SpotFrames:
-    """Frames of which the spots are known already: detected before, or marked by hand.
+    """Frames with known spots: detected before, or marked by hand.
 
     Attributes:
         looks: spots of each frame.
-        images: where they were detected; None where there are none, only positions.
+        images: of the spots; None if there are only positions.
     """
 
     looks: Sequence[FrameSpots]
@@ -142,11 +145,11 @@ class SpotFrames:
         return len(self.looks)
 
     def look(self, detector: SpotFinder) -> list[FrameSpots]:
-        """See `Frames`."""
+        """Return the known spots, as `Frames` declares."""
         return list(self.looks)
 
     def windows(self, plan: Windows) -> Float32Array:
-        """See `Frames`."""
+        """Cut the windows of every frame; nan without images."""
         if self.images is not None:
             return self.images.windows(plan)
         return np.full((*plan.corner.shape[:2], plan.side, plan.side), np.nan, dtype=np.float32)
@@ -156,10 +159,10 @@ class SpotFrames:
 class Scan:
     """One scan of the phantom: its images and the nominal pose of each.
 
-    `priors` are the standard deviations of the scanner's offsets [mm, deg, 1], see `fit.priors`.
-    `index` (n, beads) says which spot of each frame is which bead (-1: none), where that is known.
-    `arc` is the part of a step that the object turns while a frame is exposed, 0 where it stands
-    still; None: nobody says it.
+    `priors` are the standard deviations of the scanner's offsets [mm, deg, 1], see
+    `fit.priors`. `index` (n, beads) is the spot of each bead in each frame (-1: unseen),
+    where that is known. `arc` is the part of a step that the object turns while a frame
+    is exposed, 0 where it is at rest; None: not stated.
     """
 
     frames: Frames

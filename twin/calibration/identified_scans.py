@@ -1,4 +1,4 @@
-"""Which spot is which bead in every scan, and what is wrong where that cannot be told."""
+"""Identification of the beads' spots in every scan, and findings where it fails."""
 
 from __future__ import annotations
 
@@ -22,17 +22,27 @@ from flexdt.twin.calibration.outcome import Calibration
 from flexdt.twin.calibration.request import CalibrationRequest
 
 MANY: Final = 0.6
-"""Part of a frame's spots that are beads up to which it may show another frame's angle."""
+"""Largest part of a frame's spots that are beads for it to be tried at another frame's
+angle."""
 NEAR_PX: Final = 3.0
-"""Typical distance of spots from beads above which an assignment tells nothing of the frames."""
+"""Typical distance of spots from beads above which an assignment says nothing about
+frames [px]."""
 CLEAR_PX: Final = 0.6
-"""The same up to which the whole scan tells the geometry better than its parts."""
+"""The same up to which an entire scan determines the geometry better than its parts [px]."""
 LEAST_TYPICAL_PX: Final = 0.3
-"""It is taken to be at least this: a part of a scan tells a geometry less well than the whole."""
+"""Least value of that distance: a part of a scan determines the geometry less well [px]."""
 
 
 def identify_scans(state: Calibration, request: CalibrationRequest) -> Calibration:
-    """Find which spot is which bead, scan by scan until one tells nothing."""
+    """Identify the bead of each spot, scan by scan until one fails.
+
+    Args:
+        state: scans with their spots.
+        request: gives the start.
+
+    Returns:
+        The state with identifications and findings.
+    """
     out: list[Identification] = []
     findings: list[Finding] = []
     looks = list(state.looks)
@@ -66,13 +76,13 @@ def identify_scans(state: Calibration, request: CalibrationRequest) -> Calibrati
 
 
 def _spots(scan: Scan, looks: Sequence[FrameSpots]) -> list[Detections]:
-    """The spots of each frame, none of those that show another frame's."""
+    """Return the spots of each frame; empty for frames that repeat another."""
     unseen = nothing(scan.frames.shape)
     return [unseen if look.state is FrameState.REPEATED else look.detections for look in looks]
 
 
 def _without(looks: Sequence[FrameSpots], frames: Sequence[int]) -> tuple[FrameSpots, ...]:
-    """The looks with some frames that are not used."""
+    """Mark some frames as unused."""
     again = frozenset(frames)
     return tuple(
         replace(look, state=FrameState.REPEATED) if i in again else look
@@ -86,7 +96,17 @@ def _numbers(
     model: BeadModel,
     scan: Scan,
 ) -> FrameNumbers | None:
-    """Which angle each frame shows, where some frames do not agree with the others."""
+    """Find the angle that each frame shows, if some frames do not agree with the others.
+
+    Args:
+        found: identification of the scan, or None.
+        detections: spots of each frame.
+        model: the beads.
+        scan: its poses and name.
+
+    Returns:
+        None if all agree, or no angles fit.
+    """
     counts = np.array([len(d) for d in detections])
     if found is not None:
         seen = (found.index >= 0).sum(axis=1)

@@ -32,14 +32,14 @@ from flexdt.twin.geometry.poses import Poses
 LOOSE_PX = 0.6
 """Root mean square distance of spots from their beads above which panel and axis are loosened."""
 LOOSE = 15.0
-"""So many times as wide are their priors then."""
+"""Factor on the priors of the offsets in `loose`."""
 WIDE_PX, NARROW_PX = (120.0, 60.0, 40.0), (25.0, 15.0, 10.0)
 """Gates of the rounds from all start angles, and of those from the promising ones."""
 FINALISTS = 4
-"""Hypotheses finished on all frames."""
+"""Number of hypotheses finished on all frames."""
 RIVAL = 25.0
-"""A hypothesis is a rival if its squared residuals, in units of the best one's variance, exceed the
-best's by less than this."""
+"""Largest excess of a rival's squared residuals over the best hypothesis's, in units of
+its variance."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Search:
 
 @dataclass(frozen=True, eq=False)
 class Identification:
-    """Tracks of the beads and how well they are founded.
+    """Tracks of the beads and their quality.
 
     Attributes:
         tracks: (n, k, 2) pixels, nan where unseen.
@@ -68,10 +68,11 @@ class Identification:
         index: (n, k) number of the detection in its frame, -1 where unseen.
         parameters: rough geometry behind the assignment (internal units).
         rms_px: residual of the assigned spots.
-        explained: share of the whole detected spots that are some bead.
+        explained: share of the complete spots that are some bead.
         found: share of the beads in view that have a spot, in frames that show any.
         rivals: other geometries that explain the spots as well, with other angles.
-        typical_px: `rms_px` as the median has it, which a few wrong spots do not change.
+        typical_px: `rms_px` estimated from the median, which a few wrong spots do not
+            change.
     """
 
     tracks: FloatArray
@@ -98,7 +99,7 @@ def identify_beads(
     *,
     start: Offsets = NOMINAL,
 ) -> FloatArray:
-    """Tracks (n, beads, 2) in pixels, nan where unseen; see `identify` for more about them.
+    """Identify tracks (n, beads, 2) in pixels, nan where unseen; see `identify` for details.
 
     Args:
         detections: spots of each of the n frames.
@@ -155,11 +156,11 @@ def identify(
         geometry: rough geometry of each frame; positions may be off by centimetres and the start
             angle may be anything, but the angles between frames must be right.
         start: offsets to begin with.
-        search: how; None is the default.
-        loose: standard deviations [mm, deg, 1] of what else may be off.
+        search: settings; None is the default.
+        loose: standard deviations [mm, deg, 1] of other offsets that may be off.
 
     Raises:
-        TwinError: frames and geometry differ in number, or there is no spot at all.
+        TwinError: frames and geometry differ in number, or there is no spot.
     """
     how = Search() if search is None else search
     model = bead_model(phantom)
@@ -205,7 +206,7 @@ def identify(
 def attempt(
     detections: Sequence[Detections], model: BeadModel, poses: Poses, **how: Any
 ) -> Identification | None:
-    """`identify` with the options `how`; None where nothing fits."""
+    """Call `identify` with the options `how`; None where nothing fits."""
     try:
         return identify(detections, model, poses, **how)
     except TwinError:
@@ -215,7 +216,13 @@ def attempt(
 def identified(
     index: npt.NDArray[np.int64], detections: Sequence[Detections], start: Offsets
 ) -> Identification:
-    """The tracks where somebody knows which spot is which bead: `index` (n, beads), -1 unseen."""
+    """Make the identification from known spots.
+
+    Args:
+        index: (n, beads) spot of each bead, -1 unseen.
+        detections: spots of each frame.
+        start: offsets that it keeps.
+    """
     shadows = _Shadows.of(detections)
     origin = (np.array([d.shape[::-1] for d in detections], dtype=np.float64) - 1) / 2
     return Identification(*shadows.picked(index, origin), index, start, math.nan, 1.0, 1.0, ())
@@ -234,6 +241,7 @@ class _Shadows:
 
     @classmethod
     def of(cls, detections: Sequence[Detections]) -> _Shadows:
+        """Pack the spots of all frames into arrays, padded to the largest number."""
         counts = np.array([len(d) for d in detections], dtype=np.int64)
         n, m = len(detections), max(int(counts.max()), 1)
         points = np.full((n, m, 2), np.inf)
@@ -250,7 +258,9 @@ class _Shadows:
     def picked(
         self, index: npt.NDArray[np.int64], origin: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Tracks [px], covariances and bias of the spots that `index` names, nan and 0 for none."""
+        """Return tracks [px], covariances and bias of the spots in `index`; nan and 0 for
+        unseen beads.
+        """
         seen = index >= 0
         rows, pick = np.arange(len(index))[:, None], np.maximum(index, 0)
         tracks = self.points[rows, pick] + origin[:, None, :]
@@ -286,7 +296,7 @@ def _spread(frames: npt.NDArray[np.intp], count: int) -> npt.NDArray[np.intp]:
 def assign(
     predicted: FloatArray, points: FloatArray, counts: npt.NDArray[np.int64], gate: float
 ) -> npt.NDArray[np.int64]:
-    """Best one-to-one assignment within each frame.
+    """Assign spots to predictions one-to-one within each frame, at the least sum of squares.
 
     Args:
         predicted: (n, k, 2).
@@ -295,7 +305,7 @@ def assign(
         gate: pairs further apart are not assigned [px].
 
     Returns:
-        (n, k) index of the spot, -1 where none.
+        (n, k) index of the spot, -1 without one.
     """
     from scipy.optimize import linear_sum_assignment
 
@@ -315,7 +325,13 @@ def assign(
 
 
 def _vote(problem: FitProblem, shadows: _Shadows, x: FloatArray) -> FloatArray:
-    """`x` with dO_x and dO_y changed so that prediction and spots lie on top of each other."""
+    """Change dO_x and dO_y in `x` so that prediction and spots overlap.
+
+    Args:
+        problem: gives the prediction.
+        shadows: the spots.
+        x: (c,) column values.
+    """
     try:
         predicted = _predicted(problem, x)
     except TwinError:
@@ -342,7 +358,7 @@ def _vote(problem: FitProblem, shadows: _Shadows, x: FloatArray) -> FloatArray:
 
 
 def _predicted(problem: FitProblem, x: FloatArray) -> FloatArray:
-    """Spots (n, k, 2) from the image's centre [px]."""
+    """Predict spots (n, k, 2) from the image's centre [px]."""
     return problem.residuals(x)[0] - problem.origin[:, None, :]
 
 
@@ -355,8 +371,20 @@ def _followed(
     cap: float,
     give_up: bool,
 ) -> _Hypothesis:
-    """Assign and fit with each gate in turn, until the last one changes nothing; the loss is per
-    possible match, capped at `cap`. It is infinite where fewer than four match, to `give_up`."""
+    """Assign and fit with each gate in turn, until the last one changes nothing.
+
+    Args:
+        problem: of the fit.
+        shadows: the spots.
+        x: (c,) start.
+        gates: in turn [px].
+        solver: of each fit.
+        cap: distance at which the loss is capped [px].
+        give_up: whether fewer than four matches give an infinite loss.
+
+    Returns:
+        The hypothesis, with its loss per possible match.
+    """
     used, before = math.nan, np.zeros(0, np.int64)
     try:
         predicted = _predicted(problem, x)
@@ -387,7 +415,9 @@ def _rounds(
 
 
 def _loss(predicted: FloatArray, shadows: _Shadows, cap: float) -> tuple[float, int]:
-    """Mean capped squared distance of the spots to their beads; number explained."""
+    """Compute the mean capped squared distance of the spots to their beads, and the
+    number explained.
+    """
     index = assign(predicted, shadows.points, shadows.counts, cap)
     frames, beads = np.nonzero(index >= 0)
     d2 = np.sum(
@@ -401,7 +431,7 @@ def _loss(predicted: FloatArray, shadows: _Shadows, cap: float) -> tuple[float, 
 def _with_tracks(
     problem: FitProblem, shadows: _Shadows, index: npt.NDArray[np.int64]
 ) -> FitProblem:
-    """The problem with the assigned spots as measurements of unit weight."""
+    """Set the assigned spots as measurements of unit weight."""
     tracks, _, bias = shadows.picked(index, np.zeros((len(index), 2)))
     whiten = np.broadcast_to([1.0, 0.0, 1.0], (*index.shape, 3)).copy()
     return replace(
@@ -410,7 +440,7 @@ def _with_tracks(
 
 
 def _different(hypotheses: Sequence[_Hypothesis]) -> list[_Hypothesis]:
-    """Hypotheses that ended at different angles, best first."""
+    """Keep hypotheses that ended at different angles, best first."""
     out: list[_Hypothesis] = []
     for h in hypotheses:
         if math.isfinite(h.loss) and all(_turn_between(h.x, o.x) > math.radians(3.0) for o in out):
@@ -419,15 +449,24 @@ def _different(hypotheses: Sequence[_Hypothesis]) -> list[_Hypothesis]:
 
 
 def _turn_between(a: FloatArray, b: FloatArray) -> float:
-    """Smallest angle between the start angles of two hypotheses [rad]."""
+    """Return the smallest angle between the start angles of two hypotheses [rad]."""
     return abs((float(a[3] - b[3]) + math.pi) % (2.0 * math.pi) - math.pi)
 
 
 def _finish(
     problem: FitProblem, shadows: _Shadows, h: _Hypothesis, how: Search, wide_px: float = 20.0
 ) -> _Hypothesis:
-    """Assign and fit on all frames. The gate narrows from `wide_px`; columns that the hypothesis
-    lacks start where the problem has them."""
+    """Assign and fit on all frames; the gate narrows from `wide_px`.
+
+    Columns that the hypothesis lacks start at the problem's values.
+
+    Args:
+        problem: of all frames.
+        shadows: their spots.
+        h: the hypothesis.
+        how: settings.
+        wide_px: first gate [px].
+    """
     x = np.concatenate([h.x, problem.start[len(h.x) :]])
     gates = [max(wide_px, how.gate_px)]
     while gates[-1] > max(20.0, how.gate_px):
@@ -445,6 +484,7 @@ def _report(
     start: Offsets,
     how: Search,
 ) -> Identification:
+    """Make the identification of the best hypothesis: tracks, quality and rivals."""
     model, poses = problem.model, problem.poses
     if not finals or not math.isfinite(finals[0].loss):
         raise TwinError(
@@ -493,7 +533,7 @@ def _at(problem: FitProblem, x: FloatArray, start: Offsets) -> Offsets:
 
 
 def overlapping(predicted: FloatArray, radii: FloatArray) -> npt.NDArray[np.bool_]:
-    """Beads whose predicted spot touches another one, (n, k)."""
+    """Mark beads whose predicted spot touches another one, (n, k)."""
     distance = np.linalg.norm(predicted[:, :, None] - predicted[:, None], axis=3)
     reach = 1.12 * (radii[:, :, None] + radii[:, None]) + 2.0
     k = predicted.shape[1]

@@ -21,7 +21,16 @@ from flexdt.twin.calibration.request import CalibrationRequest
 def fit_with_motion(
     state: Calibration, request: CalibrationRequest, fit: FitResult
 ) -> tuple[Calibration, FitResult]:
-    """Put the motion of the scans into their poses, and fit to them."""
+    """Put the motion of the scans into their poses, and fit to them.
+
+    Args:
+        state: the scans and their measurements.
+        request: the free parameters, and those that may move.
+        fit: the last one.
+
+    Returns:
+        The state with the motion, and the fit.
+    """
     still = [s.poses for s in state.scans]
     if state.motions:
         still = [m.applied(p, -1.0) for p, m in zip(still, state.motions, strict=True)]
@@ -45,7 +54,16 @@ def fit_with_motion(
 def settle_motion(
     state: Calibration, request: CalibrationRequest, fit: FitResult
 ) -> tuple[Calibration, list[Finding]]:
-    """Widen the sigmas of the motion by what the last fit would make of it."""
+    """Widen the sigmas of the motion by the change that the last fit would make to it.
+
+    Args:
+        state: with a motion.
+        request: the parameters that may move.
+        fit: the last one.
+
+    Returns:
+        The state, and a finding if the motion still changes.
+    """
     held = state.motion
     assert held is not None
     again = estimate_motion(fit, request.per_frame, held, search=False)

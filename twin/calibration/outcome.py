@@ -1,4 +1,4 @@
-"""The outcome of a calibration, and what is known so far while one is under way."""
+"""The outcome of a calibration, complete or under way."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ from flexdt.twin.geometry.panel import Panel
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """The outcome, or as much of it as there is.
+    """The outcome of a calibration, as far as it got.
 
     Attributes:
-        fit: the last fit made, with its certificate; None if it never came to one.
-        identifications: of each scan, as far as it came.
-        findings: what is wrong with the data, worst first.
+        fit: the last fit made, with its certificate; None before the first.
+        identifications: of each scan, as far as it got.
+        findings: faults of the data, worst first.
         looks: detections and state of every frame of each scan.
         measured: positions of the second measurement of each scan; empty without one.
-        scans: what was calibrated, with the motion found in their poses.
+        scans: that were calibrated, with the motion found in their poses.
         model: the phantom's beads.
-        motion: what was found to move; None if it was not asked for.
-        lags: of the camera in each scan, taken out of what was measured.
+        motion: that was found; None if it was not requested.
+        lags: of the camera in each scan, removed from the measurements.
     """
 
     fit: FitResult | None
@@ -52,7 +52,7 @@ class Calibration:
 
     @property
     def motions(self) -> tuple[Motion, ...]:
-        """The motion of each scan; empty if it was not asked for."""
+        """The motion of each scan; empty if it was not requested."""
         return () if self.motion is None else self.motion.motions
 
     @property

@@ -1,8 +1,8 @@
 """From images to a geometry with its uncertainty report: detect, identify, fit, measure again, fit,
 diagnose.
 
-Several scans may be given; they are identified one by one and fitted together. The result lists
-what is wrong with the data, and offers numbers only where they can be trusted.
+Several scans may be given; they are identified one by one and fitted together. The result
+lists the faults of the data, and offers numbers only where they can be trusted.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ __all__ = ["Calibration", "CalibrationRequest", "FrameState", "Scan", "calibrate
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """A calibration under way: the last fit, and what is free in it.
+    """A calibration under way: the last fit and its request.
 
     Attributes:
         state: scans, measurements and findings.
-        request: with all six main parameters free, where the data tell them apart.
+        request: with all six main parameters free, where the data separate them.
         fit: the last fit.
         iterations: of all fits so far.
     """
@@ -62,7 +62,7 @@ class Fitted:
 
     @property
     def outcome(self) -> Calibration:
-        """What is known so far."""
+        """The outcome so far."""
         return replace(self.state, fit=self.fit)
 
     def with_findings(self, *more: Finding) -> Fitted:
@@ -83,10 +83,11 @@ def calibrate(
     Args:
         scans: one or more scans of the same phantom.
         phantom: its beads.
-        request: what to estimate; None is the thesis's six parameters.
+        request: the parameters to estimate; None is the thesis's six parameters.
         scene: the phantom's solids, so that its body can be subtracted; None is the phantom's own
             if it has one.
-        detector: what spots to look for; None: from the phantom's beads and the geometry.
+        detector: settings of the detection; None: from the phantom's beads and the
+            geometry.
 
     Raises:
         TwinError: a scan has no frames, or the same images as another.
@@ -116,6 +117,14 @@ def calibrate(
 
 def _detected(scans: Sequence[Scan], model: BeadModel, detector: SpotFinder | None) -> Calibration:
     """Detect spots in all frames, and judge the frames.
+
+    Args:
+        scans: the scans.
+        model: the beads.
+        detector: settings; None: from beads and geometry.
+
+    Returns:
+        The state with spots and findings.
 
     Raises:
         TwinError: scans share images.
@@ -166,7 +175,9 @@ def _second_fit(fitted: Fitted, solids: Scene | None) -> Fitted:
 
 
 def _diagnosed(fitted: Fitted, asked: CalibrationRequest) -> Calibration:
-    """Explain the residuals, check what was not estimated, and give the outcome."""
+    """Explain the residuals, check the parameters that were not estimated, and return the
+    outcome.
+    """
     fit, explained = explain(fitted.state, fitted.request, fitted.fit)
     state = _judged_places(fitted.state, fit, explained)
     state, fit, explained = _fixed_as_asked(state, asked, fitted.request, fit, explained)
@@ -198,14 +209,15 @@ def _fixed_as_asked(
     fit: FitResult,
     explained: list[Finding],
 ) -> tuple[Calibration, FitResult, list[Finding]]:
-    """Fix what is not asked for, if it is where the data have it; the motion follows the new fit.
+    """Fix the parameters that were not requested, if they agree with the data; motion is
+    fitted again.
 
     Args:
-        state: the scans, and what was measured in them.
+        state: the scans and their measurements.
         asked: the user's request.
         free: the request with which `fit` was made.
         fit: the last fit.
-        explained: what explains its residuals.
+        explained: findings on its residuals.
     """
     fixed, explained = check_fixed(state, asked, free, fit, explained)
     narrower = list(fixed.values) != list(fit.values)

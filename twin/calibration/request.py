@@ -1,4 +1,4 @@
-"""What a calibration estimates and how, and the priors that follow for the scans."""
+"""The parameters and settings of a calibration, and the resulting priors of the scans."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ from flexdt.twin.geometry.motion import require_movable
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 
 ANYWHERE = 1e3
-"""A prior [mm, deg] so wide that the images alone say where its parameter is."""
+"""Prior [mm, deg] so wide that the images alone determine its parameter."""
 
 
 @dataclass(frozen=True)
 class CalibrationRequest:
-    """What to estimate and how.
+    """The parameters and settings of a calibration.
 
     Attributes:
         free: parameters to estimate.
         per_scan: those with a value of their own in every scan.
         reading: of eq. 5.4.
-        start: offsets to begin with, and the centre of every prior; what is neither free nor has a
-            prior stays there.
-        bead_tolerance_mm: > 0: bead positions are unknowns with this prior. 0: they are where the
-            phantom says. None: the phantom as a whole may be strained by STRAIN, and single beads
-            are unknowns only if the residuals ask for it.
+        start: offsets to begin with, and the centre of every prior; parameters that are
+            neither free nor have a prior stay there.
+        bead_tolerance_mm: > 0: bead positions are unknowns with this prior. 0: they are
+            at their stated places. None: the phantom may be strained by STRAIN, and
+            single beads are unknowns only if the residuals require it.
         second_look: measure again where the first fit predicts the beads.
-        priors: standard deviations [mm, deg, 1] in place of the scans' own; 0 is exactly known. The
-            scans' apply to what is not free, these to anything.
+        priors: standard deviations [mm, deg, 1] in place of the scans' own; 0 is exactly
+            known. The scans' apply to parameters that are not free, these to any.
         bound: sigma [mm, deg] beyond which the result is not identifiable.
         known_sizes: the beads' radii are known; else they were taken from the spots.
         misfit_px: residual above which a fit is not to be used unless explained.
@@ -52,8 +52,8 @@ class CalibrationRequest:
 
     Raises:
         UnknownNameError: a name that is no parameter, or cannot differ from frame to frame.
-        TwinError: nothing is free, the tolerance or a prior is none, one of `per_scan` is not free,
-            or something is free that is exactly known.
+        TwinError: nothing is free, the tolerance or a prior is invalid, one of `per_scan`
+            is not free, or a parameter is both free and exactly known.
     """
 
     free: tuple[str, ...] = SIX
@@ -95,7 +95,9 @@ def priors_of(scans: Sequence[Scan], request: CalibrationRequest) -> dict[str, f
 
 
 def stated_priors(scans: Sequence[Scan], request: CalibrationRequest) -> dict[str, float]:
-    """Give the request's priors, and the widest of the scans' for what is not free; 0: exact."""
+    """Return the request's priors, and the widest of the scans' for parameters that are
+    not free; 0: exact.
+    """
     return known(request.free, request.priors, [scan.priors for scan in scans])
 
 

@@ -54,8 +54,8 @@ def require_seen_from_source(scan: Scan) -> None:
 def require_different(scans: Sequence[Scan], looks: Sequence[Sequence[FrameSpots]]) -> None:
     """Check that no image is given twice, which would count as twice the evidence.
 
-    No two images have the same noise, so none has all its spots where another has them, to the
-    last digit.
+    No two images have the same noise, so no image has all its spots at another's places,
+    to the last digit.
 
     Raises:
         TwinError: names two scans that share images.

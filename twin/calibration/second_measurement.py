@@ -40,13 +40,13 @@ def measure_again(
     it, with a finding.
 
     Args:
-        state: the scans, and which spot is which bead.
-        request: what is free.
+        state: the scans, identified.
+        request: the free parameters.
         fit: to the first measurement.
-        solids: the phantom's, to subtract its body; None if it has none.
+        solids: the phantom's, to subtract its body; None without solids.
 
     Returns:
-        The state with what was measured, the fit to it, and the iterations of all fits.
+        The state with the measurements, the fit to them, and the iterations of all fits.
     """
     first, iterations = (state, fit), 0
     windows = sum(len(s.frames) for s in state.scans) * len(state.model)
@@ -68,7 +68,17 @@ def measure_again(
 def _measured(
     state: Calibration, fit: FitResult, solids: Scene | None, draft: bool
 ) -> tuple[Calibration, list[Windows]]:
-    """Measure the beads of every scan where a fit expects them; the lag in the first round only."""
+    """Measure the beads of every scan at their fitted places; the lag in the first round only.
+
+    Args:
+        state: the scans, identified.
+        fit: gives the geometry of each scan.
+        solids: the phantom's, or None.
+        draft: see `measure_beads`.
+
+    Returns:
+        The state with measurements and lags, and the windows of each scan.
+    """
     measured, lags, plans = [], [], []
     model = replace(state.model, beads=fit.beads)
     for g, scan in enumerate(state.scans):

@@ -1,9 +1,9 @@
-"""Markers whose positions nobody knows: which spots are the same marker, and where it is.
+"""Markers at unknown positions: the spots of each marker, and its position.
 
-Two spots of different frames are two rays. Where the rays (nearly) meet there may be a marker, and
-there is one where a spot lies at its projection in many other frames. Positions and assignment are
-rough, those of a nominal geometry; the bundle adjustment of `pipeline.calibrate` then estimates
-positions and geometry together.
+Two spots of different frames are two rays. Where the rays (nearly) meet there may be a
+marker, and there is one if many other frames have a spot at its projection. Positions and
+assignment are rough, those of a nominal geometry; the bundle adjustment of
+`pipeline.calibrate` then estimates positions and geometry together.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ from flexdt.twin.geometry.poses import Poses
 Index = npt.NDArray[np.int64]
 
 UNKNOWN: Final = "unknown"
-"""Name that stands for markers of unknown positions."""
+"""Name of a phantom of markers at unknown positions."""
 ANYWHERE_MM: Final = 1e3
 """Standard deviation of the prior on the position of an unknown marker."""
 GATES_PX: Final = (12.0, 5.0, 3.0)
-"""How far a spot may lie from a marker's projection: in the first rough geometry, after one fit,
-after two."""
+"""Largest distance of a spot from a marker's projection: in the first rough geometry,
+after one fit, after two [px]."""
 SHARE: Final = 0.3
-"""A marker has a spot in so many of the frames at least."""
+"""Least share of the frames with a spot of a marker."""
 BASES: Final = 6
-"""Frames whose spots are paired with those of others."""
+"""Number of frames whose spots are paired with those of others."""
 SCORED: Final = 60
-"""Candidates are compared in so many frames at most."""
+"""Largest number of frames in which candidates are compared."""
 
 
 def link(
     detections: Sequence[Detections], poses: Poses, start: Offsets
 ) -> tuple[Index, FloatArray, Offsets]:
-    """Which spot of each frame is which marker.
+    """Find the marker of each spot.
 
     Args:
         detections: spots of each of the n frames.
@@ -52,8 +52,8 @@ def link(
         start: offsets to begin with.
 
     Returns:
-        (n, k) number of the spot of marker k, -1 where there is none; positions (k, 3) [mm], from
-        the highest marker to the lowest; and the offsets that go with them.
+        (n, k) number of the spot of marker k, -1 without one; positions (k, 3) [mm], from
+        the highest marker to the lowest; and their offsets.
 
     Raises:
         TwinError: fewer than three markers are found.
@@ -97,7 +97,7 @@ def link(
 
 
 def triangulate(tracks: FloatArray, cone: ConeVec, shape: tuple[int, int]) -> FloatArray:
-    """The points nearest to the rays of each marker, (k, 3) [mm].
+    """Triangulate the point nearest to the rays of each marker, (k, 3) [mm].
 
     Args:
         tracks: (n, k, 2) pixels (column, row), nan where unseen; each seen twice or more.
@@ -123,11 +123,10 @@ def triangulate(tracks: FloatArray, cone: ConeVec, shape: tuple[int, int]) -> Fl
 
 
 def centred(points: FloatArray, poses: Poses, shape: tuple[int, int], start: Offsets) -> Offsets:
-    """`start` with the axis where the spots' mean column is: over a full turn a marker's is the
-    axis's.
+    """Move the axis in `start` to the mean column of the spots: over a full turn they agree.
 
     Args:
-        points: (n, m, 2) pixels, not finite where there is none.
+        points: (n, m, 2) pixels, not finite without a spot.
         poses: nominal geometry.
         shape: detector (rows, cols).
         start: offsets to begin with.
@@ -141,7 +140,7 @@ def centred(points: FloatArray, poses: Poses, shape: tuple[int, int], start: Off
 def _rays(
     tracks: FloatArray, cone: ConeVec, shape: tuple[int, int]
 ) -> tuple[FloatArray, FloatArray]:
-    """Source (n, 3) and unit direction (n, k, 3) of the ray to each spot."""
+    """Return source (n, 3) and unit direction (n, k, 3) of the ray to each spot."""
     off = tracks - (np.array(shape[::-1]) - 1) / 2
     at = (
         cone.detector[:, None]
@@ -153,7 +152,14 @@ def _rays(
 
 
 def _found(points: FloatArray, counts: Index, cone: ConeVec, shape: tuple[int, int]) -> FloatArray:
-    """Positions of markers, the best founded first, (k, 3)."""
+    """Find positions of markers, those with most spots first, (k, 3).
+
+    Args:
+        points: (n, m, 2) pixels, inf beyond each frame's count.
+        counts: (n,) spots in each frame.
+        cone: rough geometry.
+        shape: detector (rows, cols).
+    """
     finite = np.where(np.isfinite(points), points, np.nan)
     source, ray = _rays(finite, cone, shape)
     usable = np.flatnonzero(counts > 0)

@@ -1,11 +1,12 @@
-"""Geometry of an ordinary circular scan from its own projections: what it tells, and what not.
+"""Geometry of an ordinary circular scan from its own projections, and its limits.
 
-Mirror symmetry (`mirror_symmetry.py`) tells where the image of the axis lies and, less well, the
-panel's yaw; planes through two sources (`plane_pairs.py`) tell the row in which the source turns
-and shifts of single frames. They are given as offsets: dO_x for the column,
-det_roll for the panel against the axis, det_yaw, dD_y for the row. A panel shifted sideways looks
-as an axis shifted the other way does, but for a yaw of shift / SDD, and one shifted upwards as an
-axis that leans, but for a pitch: the geometry as a whole is right whichever of the two it was.
+Mirror symmetry (`mirror_symmetry.py`) determines the image of the axis and, less well,
+the panel's yaw; planes through two sources (`plane_pairs.py`) determine the row in which
+the source turns and shifts of single frames. They are given as offsets: dO_x for the
+column, det_roll for the panel against the axis, det_yaw, dD_y for the row. A panel
+shifted sideways looks like an axis shifted the other way, but for a yaw of shift / SDD,
+and one shifted upwards like an axis that leans, but for a pitch: the complete geometry is
+right whichever of the two it was.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ NEEDS_TURN: Final = "a full turn of more rows tells it; the correction keeps wha
 
 
 def _or_refused(find: Callable[P, Alignment]) -> Callable[P, Alignment]:
-    """Refuse in the result what is not identifiable."""
+    """Turn the error of a scan that is not identifiable into refusals in the result."""
 
     @wraps(find)
     def found(*args: P.args, **options: P.kwargs) -> Alignment:
@@ -74,12 +75,12 @@ def align_turn(
         base: offsets in force; dO_x, det_roll, det_yaw and dD_y are replaced.
         priors: standard deviation of each offset [mm, deg]; those of the panel and of axis_tilt_x
             count.
-        random: for images of noise, which tell what noise does.
+        random: for images of noise, which show the effect of noise.
         per_frame: whether shifts of single frames are looked for.
         panel: the distortion that is undone in the images.
 
     Returns:
-        The alignment; what the scan cannot tell is in `refused`.
+        The alignment; parameters that the scan does not determine are in `refused`.
     """
     scan = CircularScan.of(image, poses, present, shape, base, priors)
     plane = find_plane(scan, panel, random)
@@ -111,7 +112,9 @@ def align_turn(
 def _plane_parameters(
     plane: SymmetryPlane,
 ) -> tuple[dict[str, AlignEstimate], dict[str, str]]:
-    """Give the parameters that the plane of symmetry tells, and why it does not tell others."""
+    """Return the parameters that the plane of symmetry determines, and name -> reason for
+    the others.
+    """
     column = plane.scan.column(plane.values)
     parameters = {"axis_column_px": AlignEstimate(column, plane.column_sigma_px, "px")}
     refused = {}
@@ -137,7 +140,7 @@ def _motion(
     """Find the shifts of single frames.
 
     Raises:
-        NotIdentifiableError: frames are repeated, or the images do not tell shifts.
+        NotIdentifiableError: frames are repeated, or the images do not determine shifts.
     """
     if turn.repeated:
         raise NotIdentifiableError(
@@ -148,7 +151,13 @@ def _motion(
 
 
 def _warnings(plane: SymmetryPlane, turn: Turn, missing: int) -> tuple[str, ...]:
-    """Say what is doubtful about the scan."""
+    """List doubts about the scan.
+
+    Args:
+        plane: of symmetry.
+        turn: its frames.
+        missing: number of missing frames.
+    """
     out = []
     if plane.opposite is not None and plane.opposite.warning is not None:
         out.append(plane.opposite.warning)

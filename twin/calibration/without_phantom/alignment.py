@@ -1,4 +1,6 @@
-"""What a circular scan tells of its own geometry, and what it cannot tell."""
+"""The geometry that a circular scan determines by itself, and the parameters that it does
+not.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,7 @@ UNTOLD: Final[Mapping[str, str]] = {
     "phantom tells it",
     "dO_y": "a shift along the axis moves the object alone; a phantom tells it",
 }
-"""What a circular scan, or this method, cannot tell, and why."""
+"""Parameter that a circular scan, or this method, does not determine -> the reason."""
 
 
 class AlignEstimate(NamedTuple):
@@ -33,18 +35,20 @@ class AlignEstimate(NamedTuple):
 
 @dataclass(frozen=True)
 class Alignment:
-    """What a scan tells of its geometry.
+    """The geometry determined from a scan.
 
     Attributes:
-        offsets: the correction, all of it: what was in force with what was found; None: refused.
-        parameters: axis_column_px and, if the images tell them, det_roll, det_yaw and
-            source_row_px [px, deg].
-        refused: name -> why it is not given.
-        warnings: what is doubtful about the scan.
-        frames: number of those that were used.
-        motion: shifts of single frames, as shifts of the sample; None: not asked for, or refused.
-        panel: the distortion that was undone, with a gap between two tiles that was found; None:
-            there is none.
+        offsets: the complete correction: the one in force, with the estimated parameters;
+            None: refused.
+        parameters: axis_column_px and, if the images determine them, det_roll, det_yaw
+            and source_row_px [px, deg].
+        refused: name -> reason.
+        warnings: doubts about the scan.
+        frames: number of used frames.
+        motion: shifts of single frames, as shifts of the sample; None: not requested, or
+            refused.
+        panel: the distortion that was undone, with the gap between two tiles that was
+            found; None: no distortion.
     """
 
     offsets: Offsets | None

@@ -18,12 +18,12 @@ from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
 
 FREE: Final = ("dO_x", "det_roll", "det_yaw", "dD_z", "dD_y")
-"""Parameters of the plane, in this order. The last two are not told, but add to what opposite rays
-leave open."""
+"""Parameters of the plane, in this order. The last two are not determined, but add to the
+uncertainty of opposite rays."""
 OF_TURN: Final = 3
 """So many of them are parameters where there is a full turn."""
 STANDS: Final = 0.05
-"""Source and panel may move so far between frames, seen from the axis [px]."""
+"""Largest motion of source and panel between frames, seen from the axis [px]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,10 +60,10 @@ class CircularScan:
         base: Offsets,
         priors: Mapping[str, float],
     ) -> CircularScan:
-        """Check that the frames that are there lie on one circle.
+        """Check that the frames that are present form one circle.
 
         Raises:
-            NotIdentifiableError: no frame is there, or source or panel move.
+            NotIdentifiableError: no frame is present, or source or panel move.
         """
         refuse_if(len(present) == 0, "no frame is there")
         return cls(image, poses, present, shape, base, priors, _standing(poses, present))
@@ -77,13 +77,15 @@ class CircularScan:
         return np.asarray(about_axis(self.pose, self.offsets(values)).rows[0])
 
     def column(self, values: FloatArray, row: float | None = None) -> float:
-        """Give the column in which the axis crosses a row, the panel's middle one if None [px]."""
+        """Return the column in which the axis crosses a row, the panel's middle one if
+        None [px].
+        """
         rows, cols = self.shape
         middle = np.array([(cols - 1) / 2, (rows - 1) / 2 if row is None else row])
         return float(axis_in_image(self.pose, self.offsets(values), middle)[0])
 
     def azimuth(self, frames: Sequence[int]) -> FloatArray:
-        """Give the angle about the axis at which the source stands in frames, (n,) [rad]."""
+        """Return the angle of the source about the axis in frames, (n,) [rad]."""
         source = about_axis(self.poses[np.array(frames)], self.offsets(self.start)).source
         return np.asarray(np.arctan2(source[:, 1], source[:, 0]))
 
@@ -143,7 +145,7 @@ def about_axis(poses: Poses, offsets: Offsets) -> ConeVec:
 
 
 def _standing(poses: Poses, present: tuple[int, ...]) -> Poses:
-    """The pose that all frames share but for the angle of the stage.
+    """Return the pose that all frames share but for the angle of the stage.
 
     Raises:
         NotIdentifiableError: source or panel move, so the scan is not on one circle.

@@ -1,19 +1,20 @@
-"""Rays that a full turn shows from both ends: the axis column by itself, and steps beside the axis.
+"""Rays that a full turn shows from both ends: the axis column, and steps at tile borders.
 
-A ray of the source's plane that one view shows at an angle g to the ray through the axis is shown
-from its other end by the view half a turn and 2 g further, at the mirror image of its column. Both
-integrals are the same for any object, so both ends of all rays lie equally far from the axis. By
-how many pixels they do not, at each distance, is read from slopes of the images; the slope of one
-end is the instrument of the other, so that noise in slopes shortens nothing. What a column shows in
-all views alike (rings, a wrong flat field, a wall about the axis) is left out.
+A ray of the source's plane that one view shows at an angle g to the ray through the axis
+is shown from its other end by the view half a turn and 2 g further, at the mirror image
+of its column. Both integrals are the same for any object, so both ends of all rays are
+equally far from the axis. Their difference in pixels, at each distance, follows from
+slopes of the images; the slope of one end is the instrument of the other, so that noise
+in slopes shortens nothing. Structures that a column shows in all views (rings, a wrong
+flat field, a wall about the axis) are left out.
 
-A wrong axis column moves all distances alike. A gap between two tiles moves those beyond it by its
-width and no others, whatever passes there: it is an identity of the panel. What else differs from
-distance to distance (beam hardening at walls, a yaw, few views) is no step; how much that is says
-what a step must exceed.
+A wrong axis column moves all distances alike. A gap between two tiles moves those beyond
+it by its width and no others, whatever passes there: it is an identity of the panel.
+Other differences between distances (beam hardening at walls, a yaw, few views) are no
+step; their size is the threshold of a step.
 
-Uncertainties follow from leaving out sectors of the turn, those of steps from leaving out rows as
-well: a gap is in all rows, what leans is not.
+Uncertainties follow from leaving out sectors of the turn, those of steps from leaving out
+rows too: a gap is in all rows, a leaning structure is not.
 """
 
 from __future__ import annotations
@@ -34,11 +35,11 @@ from flexdt.twin.calibration.without_phantom.turn import Turn
 from flexdt.twin.geometry.conventions import FloatArray
 
 SECTORS: Final = 24
-"""Sectors of the turn that are left out in turn."""
+"""Number of sectors of the turn that are left out in turn."""
 SMOOTHING: Final = 128.0
 """Columns over the smoothing's sigma, which is one column at least."""
 VIEWS_OVER: Final = 4.0
-"""The smoothing's sigma is this part of what the panel's width turns by between views, at least."""
+"""Width of the panel's turn between views over the smoothing's sigma, at most."""
 EDGE: Final = 8
 """Views repeated at both ends for the splines over the angle."""
 ROUNDS, NEAR = 4, 0.05
@@ -46,23 +47,23 @@ ROUNDS, NEAR = 4, 0.05
 PER_SIGMA: Final = 3.0
 """Distances from the axis that are read in a sigma of the smoothing, at least a column apart."""
 BINS: Final = 24
-"""Distances from the axis are taken together in up to so many bins."""
+"""Largest number of bins of distances from the axis."""
 WIDE: Final = 2.0
-"""A bin is so many sigmas of the smoothing wide, at least."""
+"""Least width of a bin, in sigmas of the smoothing."""
 YAW_PX: Final = 0.1
 """By so much a yaw may move the ends of the panel against its middle, beyond that in force [px]."""
 LEAST_BINS: Final = 8
 """One bin of so many may be left out: where a wall turns back, more is wrong than elsewhere."""
 FEWEST_BINS: Final = 4
-"""Bins that tell something, at least."""
+"""Least number of informative bins."""
 MOST_MOVED: Final = 0.1
 """Part of the innermost bin that a step may move, at most: without a bin inside, it is a shift."""
 BEYOND, BESIDE = 3, 2
 """Whole bins beyond a step, at least, and beside it that are not left out."""
 WIDEST: Final = 5.0
-"""No gap is wider [px]."""
+"""Largest width of a gap [px]."""
 ALIKE: Final = 0.3
-"""Slopes of both ends of rays must correlate so much: of noise alone they do not."""
+"""Least correlation of the slopes of both ends of rays: noise alone has none."""
 CHANCE: Final = 1e-4
 """Probability of a step in a scan without one."""
 
@@ -72,9 +73,10 @@ class Step(NamedTuple):
 
     Attributes:
         radius: distance from the axis beyond which rays are moved [px].
-        width: by how much [px]; positive: right of the axis, everything beyond appears nearer.
+        width: of their shift [px]; positive: right of the axis, everything beyond appears
+            nearer.
         sigma: standard deviation of the width [px].
-        least: what the width must exceed to be no chance [px].
+        least: width above which it is no chance [px].
     """
 
     radius: float
@@ -117,12 +119,12 @@ class Profile:
         sigma: FloatArray,
         soft: float,
     ) -> Profile:
-        """Look for steps at all columns but those of the last bins: of one bin beyond, a wall that
-        turns back there shows as much.
+        """Look for steps at all columns but those of the last bins: with one bin beyond,
+        a wall that turns back there looks the same.
 
         Args:
             radius: of columns from the axis, (k,) [px].
-            weight: what they tell, (k,).
+            weight: their information, (k,).
             place: their bins, (k,).
             shift, sigma: of the bins, (m,) [px].
             soft: sigma of the smoothing [px].
@@ -131,8 +133,9 @@ class Profile:
         return cls(at, _basis(radius, weight, place, at, soft), shift, sigma)
 
     def best(self) -> Step:
-        """Give the step that is least a chance; up to a part of the bins, which fit it worst, left
-        out, and what that choice makes of chance in `least`."""
+        """Return the step that is least likely by chance; up to a part of the bins, which
+        fit it worst, is left out, and `least` contains the effect of that choice.
+        """
         sigma, found = self.sigma, [NO_STEP]
         border = np.abs(self.basis[:, :, 2] - 0.5).argmin(axis=1)
         for _ in range(1 + len(self.shift) // LEAST_BINS):
@@ -154,24 +157,26 @@ class Profile:
         return max(found, key=lambda one: abs(one.width) / one.least)
 
     def at(self, radius: float) -> Step:
-        """Give the step at the radius next to one; its sigma is inf where no bin lies inside."""
+        """Return the step at the radius next to one; its sigma is inf without a bin inside."""
         place = int(np.abs(self.radii - radius).argmin())
         step = self.beside_axis(radius)
         return step if self._has_inside[place] else step._replace(sigma=math.inf, least=math.inf)
 
     def beside_axis(self, radius: float) -> Step:
-        """Give the step at the radius next to one, also where it is told from a shift of the axis
-        by the innermost bin alone, which what passes the axis itself moves."""
+        """Return the step at the radius next to one, also if only the innermost bin
+        separates it from a shift of the axis; structures that pass the axis itself move
+        that bin.
+        """
         place = int(np.abs(self.radii - radius).argmin())
         return self._steps(self._widened(self.sigma, place))[0][place]
 
     @property
     def _has_inside(self) -> npt.NDArray[np.bool_]:
-        """Whether the innermost bin lies inside of a step at each radius, (r,)."""
+        """Whether the innermost bin is inside a step at each radius, (r,)."""
         return np.asarray(self.basis[:, 0, 2] < MOST_MOVED)
 
     def _fit(self, sigma: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Fit steps: values (r, 3), their covariances, and what they leave in sigmas, (r, m)."""
+        """Fit steps: values (r, 3), their covariances, and residuals in sigmas, (r, m)."""
         scaled, aim = self.basis / sigma[:, None], self.shift / sigma
         across = scaled.transpose(0, 2, 1)
         inverse = np.linalg.inv(across @ scaled + np.diag([1e-9, 1.0, 1e-9]))
@@ -180,7 +185,7 @@ class Profile:
         return values, np.asarray(inverse, dtype=np.float64), rest
 
     def _steps(self, sigma: FloatArray) -> tuple[list[Step], FloatArray]:
-        """Give the steps at all radii, and what they leave in sigmas, (r, m)."""
+        """Return the steps at all radii, and their residuals in sigmas, (r, m)."""
         values, inverse, rest = self._fit(sigma)
         count, dropped = len(sigma), int(np.isinf(sigma).sum())
         chances = 2.0 * count * math.comb(count, dropped)
@@ -190,7 +195,13 @@ class Profile:
         return [Step(radius, width, one, one * times) for radius, width, one in table], rest
 
     def _widened(self, sigma: FloatArray, place: int) -> FloatArray:
-        """Widen the standard deviations of bins until a step at a radius leaves no more, (m,)."""
+        """Widen the standard deviations of bins until the residuals of a step at a radius
+        are usual, (m,).
+
+        Args:
+            sigma: (m,) of the bins [px].
+            place: index of the radius.
+        """
         only = Profile(self.radii[[place]], self.basis[[place]], self.shift, sigma)
         free = int(np.isfinite(sigma).sum()) - 2
 
@@ -207,11 +218,12 @@ class Profile:
 
 
 def _spread(widths: FloatArray, rest: FloatArray, usable: npt.NDArray[np.bool_]) -> float:
-    """Give the standard deviation of widths (r,) over radii that explain shifts about as well.
+    """Compute the standard deviation of widths (r,) over radii that explain shifts about
+    as well.
 
     Args:
         widths: of steps at the radii, (r,) [px].
-        rest: what each leaves in sigmas, (r, m).
+        rest: residuals of each in sigmas, (r, m).
         usable: whether a radius counts, (r,).
     """
     chi_square = np.square(rest).sum(axis=1)
@@ -224,11 +236,12 @@ def _spread(widths: FloatArray, rest: FloatArray, usable: npt.NDArray[np.bool_])
 def _basis(
     radius: FloatArray, weight: FloatArray, place: npt.NDArray[np.intp], at: FloatArray, soft: float
 ) -> FloatArray:
-    """Give shares of a common shift, a yaw and of steps at radii (r,) in each bin, (r, m, 3).
+    """Compute shares of a common shift, a yaw and of steps at radii (r,) in each bin, (r,
+    m, 3).
 
     Args:
         radius: of columns from the axis, (k,) [px].
-        weight: what they tell, (k,).
+        weight: their information, (k,).
         place: their bins, (k,).
         at: the radii (r,) [px].
         soft: sigma of the smoothing [px].
@@ -269,7 +282,7 @@ class ConjugateRays:
         return cls(scan, band, np.array(turn.band_rows), step)
 
     def closed(self, column: int, width: float) -> ConjugateRays:
-        """Close a gap: what lies beyond its first column moves by its width."""
+        """Close a gap: columns beyond its first one move by its width."""
         there = np.arange(self.cols, dtype=np.float64)
         at = there - np.clip(there - (column - 0.5), 0.0, width)
         low = np.minimum(np.floor(at).astype(np.intp), self.cols - 2)
@@ -283,7 +296,7 @@ class ConjugateRays:
         return float(self.rows.mean())
 
     def column(self, values: FloatArray) -> tuple[FloatArray, float]:
-        """Move the first of the parameters of the plane until both ends of rays lie alike.
+        """Move the first of the parameters of the plane until both ends of rays agree.
 
         Args:
             values: parameters in the order of `circular_scan.FREE`, (k,).
@@ -310,7 +323,7 @@ class ConjugateRays:
             values: parameters in the order of `circular_scan.FREE`, (k,).
 
         Returns:
-            The profile; None where too little turns.
+            The profile; None if too little of the object turns.
         """
         radius, moved, told, power = self._sums(values)
         if len(radius) == 0:
@@ -333,9 +346,16 @@ class ConjugateRays:
         return Profile.of(radius, weight, place, shift[good], sigma[good], self.smoothing)
 
     def _sums(self, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Give distances from the axis (k,); sums over each sector, group of rows and distance of
-        differences times slopes and of slopes of one end times those of the other,
-        (SECTORS, groups, k) each; the power of slopes (k,)."""
+        """Sum up differences and slopes of both ends of rays.
+
+        Args:
+            values: parameters in the order of `circular_scan.FREE`.
+
+        Returns:
+            Distances from the axis (k,); sums over each sector, group of rows and
+            distance of differences times slopes and of slopes of one end times those of
+            the other, (SECTORS, groups, k) each; the power of slopes (k,).
+        """
         axis = self.scan.column(values, self.row)
         apart_px = max(1.0, self.smoothing / PER_SIGMA)
         radius = np.arange(0.5, min(self.cols - 1 - axis, axis) - 3.0 * self.smoothing, apart_px)
@@ -359,7 +379,13 @@ class ConjugateRays:
     def _both(
         self, group: int, values: FloatArray, columns: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Read rays to columns (k,) of a group of rows from both ends in all views, (n, k) each."""
+        """Read rays to columns of a group of rows from both ends in all views, (n, k) each.
+
+        Args:
+            group: of rows.
+            values: parameters in the order of `circular_scan.FREE`.
+            columns: (k,) [px].
+        """
         view = self.scan.view(values)
         middle = (np.array(self.scan.shape[::-1]) - 1) / 2
         at = np.vstack([columns - middle[0], np.full(len(columns), self.rows[group] - middle[1]),
@@ -397,7 +423,15 @@ def _left_out(moved: FloatArray, told: FloatArray) -> tuple[float, float]:
 
 
 def _evenly(band: FloatArray, azimuth: FloatArray) -> tuple[FloatArray, float]:
-    """Sort views by their azimuth [rad], and put them at even steps over a turn; give the step."""
+    """Sort views by their azimuth, and interpolate them at even steps over a turn.
+
+    Args:
+        band: (n, groups, cols).
+        azimuth: (n,) [rad].
+
+    Returns:
+        The views, and the step [rad].
+    """
     around = azimuth % (2 * math.pi)
     order = np.argsort(around, kind="stable")
     around, band = around[order], band[order]

@@ -1,11 +1,12 @@
 """Shifts of single frames: those that make planes through two sources agree.
 
-How far every frame shows the object aside and down follows from one linear system: each pair of
-views adds as many equations for the shifts of its two frames as it sees planes. What a shift of the
-object does too, a shift common to all frames and one that turns once with the stage, is not told
-from the geometry and left out. The shifts' noise is that of an image made of noise alone, which
-goes the same way. From it and the shifts' own scatter follows how large they are at all, and what
-is left of each where noise dominates.
+The shift of the object in every frame, aside and down, follows from one linear system:
+each pair of views adds as many equations for the shifts of its two frames as it sees
+planes. Shifts that the object could make too, one common to all frames and one that turns
+once with the stage, cannot be separated from the geometry and are left out. The shifts'
+noise is that of an image made of noise alone, processed the same way. From it and the
+shifts' own scatter follow their size, and the part of each that is kept where noise
+dominates.
 """
 
 from __future__ import annotations
@@ -20,13 +21,13 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 SHIFT_ROUNDS: Final = 3
 PULLED: Final = 1e-6
-"""Weight that keeps shifts near 0 in directions of which the images say nothing."""
+"""Weight that keeps shifts near 0 in directions that the images do not determine."""
 EVIDENCE: Final = 6.0
-"""Gain in log likelihood from which on frames are said to move, as in `fitted_motion`."""
+"""Gain in log likelihood from which frames count as moving, as in `fitted_motion`."""
 WIDER: Final = 1.5
-"""Errors are taken to be so many times what disagreements and noise make of them (assumed)."""
+"""Factor on the errors estimated from disagreements and noise (assumed)."""
 LARGER: Final = 5.0
-"""Squares of shifts must be so many times those of their errors (assumed)."""
+"""Least ratio of squares of shifts to those of their errors (assumed)."""
 LEAST_TOLD: Final = 0.1
 """Share of the slopes' squares that is the object's is taken to be this at least."""
 
@@ -42,7 +43,7 @@ class Shifts(NamedTuple):
 def find_shifts(
     pairs: PlanePairs, at: FloatArray, angle: FloatArray, random: np.random.Generator
 ) -> Shifts:
-    """Shifts of all frames.
+    """Estimate the shifts of all frames.
 
     Args:
         pairs: the frames' pairs.
@@ -116,7 +117,7 @@ class _System:
         return np.stack([parts[a][side] for side in (0, 1) for a in (0, 1)], axis=1)
 
     def share(self, noise: Float32Array) -> FloatArray:
-        """What noise adds to the squares of the slopes for either shift, of all there is, (2,)."""
+        """Compute the noise's share in the squares of the slopes for either shift, (2,)."""
         own, all_ = (
             np.einsum("qak,qak,q->a", slopes, slopes, self.weight).reshape(2, 2).sum(axis=0)
             for slopes in (self._slopes(noise), self.slopes)
@@ -124,15 +125,15 @@ class _System:
         return np.asarray(own / np.maximum(all_, 1e-300))
 
     def of(self, sums: Float32Array) -> FloatArray:
-        """Differences (q, k) in other images, laid out as `PlanePairs.sums`."""
+        """Compute differences (q, k) in other images, laid out as `PlanePairs.sums`."""
         return self._difference(self.pairs.integrals(self.at, self.views, sums)[0])
 
     def solve(self, rest: FloatArray) -> FloatArray:
-        """Shifts (n, 2) that would leave such differences (q, k)."""
+        """Solve for shifts (n, 2) that would leave such differences (q, k)."""
         right = np.zeros(len(self.normal))
         np.add.at(right, self.places, np.einsum("qak,qk,q->qa", self.slopes, rest, self.weight))
         return np.asarray(np.linalg.solve(self.normal, right).reshape(-1, 2))
 
     def power(self, rest: FloatArray) -> float:
-        """Weighted sum of squares."""
+        """Compute the weighted sum of squares."""
         return float((self.weight[:, None] * np.square(rest)).sum())

@@ -1,11 +1,12 @@
-"""Whether the panel has a gap: what frames show beside a border, certified by both ends of rays.
+"""Whether the panel has a gap: seen at a border in single frames, certified by both ends
+of rays.
 
-A wall that turns back at a column looks like a gap to single frames (`tile_gap.py`); to both ends
-of the same rays (`conjugate_rays.py`) it does not. A gap is told where a step between their
-distances stands out from what the scan does at all other distances from the axis, or where the
-frames see a gap and the step there has its sign. Beside the axis, where no distance is inside
-of a step, what frames see counts by itself (`hidden_gap.py`), and what they neither show nor
-exclude is given beside the gap.
+A wall that turns back at a column looks like a gap to single frames (`tile_gap.py`); to
+both ends of the same rays (`conjugate_rays.py`) it does not. A gap is reported if a step
+between their distances exceeds the scan's differences at all other distances from the
+axis, or if the frames see a gap and the step there has its sign. Near the axis, where no
+distance is inside a step, the frames count alone (`hidden_gap.py`), and gaps that they
+neither show nor exclude are given too.
 """
 
 from __future__ import annotations
@@ -22,17 +23,17 @@ from flexdt.twin.errors import NotIdentifiableError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 SIGMAS: Final = 3.0
-"""A width of fewer sigmas is no gap."""
+"""Least width of a gap, in sigmas."""
 ROUNDS: Final = 3
-"""Times a gap is closed to see what is left of it."""
+"""Number of times a gap is closed to measure its remainder."""
 
 
 class GapFound(NamedTuple):
-    """What a scan tells of a gap between two tiles.
+    """The gap between two tiles of a scan.
 
     Attributes:
-        gap: the gap; None: none is told.
-        hidden: what is left open about one beside the axis; None: nothing, or a gap is told.
+        gap: the gap; None: no gap is reported.
+        hidden: possible gap near the axis; None: none is possible, or a gap is reported.
     """
 
     gap: Gap | None
@@ -51,10 +52,10 @@ def find_gap(
         rays: both ends of rays of a turn.
         values: parameters of the plane of symmetry in the order of `circular_scan.FREE`, (k,).
         frames: line integrals of `tile_gap.averaged_rows`, some of the turn.
-        closed: columns of borders beside which the images are filled in.
+        closed: columns of borders next to which the images are filled in.
 
     Raises:
-        NotIdentifiableError: there are two.
+        NotIdentifiableError: there are two gaps.
     """
     values, sigma = rays.column(values)
     profile = rays.profile(values) if np.isfinite(sigma) else None
@@ -103,7 +104,7 @@ def _refuted(gap: Gap, profile: Profile, axis: float) -> bool:
 
 
 def _from_step(step: Step, axis: float) -> Gap:
-    """Give the gap on that side of the axis which the sign of a step says."""
+    """Return the gap on the side of the axis that the sign of a step implies."""
     side = float(np.sign(step.width))
     return Gap(round(axis + side * step.radius + 0.5), abs(step.width), step.sigma)
 
@@ -111,7 +112,7 @@ def _from_step(step: Step, axis: float) -> Gap:
 def _closed(
     rays: ConjugateRays, values: FloatArray, column: int, width: float
 ) -> tuple[ConjugateRays, FloatArray]:
-    """Close a gap, and find the axis anew."""
+    """Close a gap, and find the axis again."""
     closed = rays.closed(column, width)
     return closed, closed.column(values)[0]
 
@@ -133,8 +134,14 @@ def _refined(rays: ConjugateRays, values: FloatArray, gap: Gap) -> Gap:
 def _require_one(rays: ConjugateRays, values: FloatArray, gap: Gap, others: Sequence[Gap]) -> None:
     """Check that no other gap is left when one is closed.
 
+    Args:
+        rays: both ends of rays of a turn.
+        values: parameters of the plane.
+        gap: to close.
+        others: further gaps seen in frames.
+
     Raises:
-        NotIdentifiableError: there is another.
+        NotIdentifiableError: there is another gap.
     """
     closed, again = _closed(rays, values, gap.column, gap.width)
     profile = closed.profile(again)

@@ -1,11 +1,11 @@
-"""A gap between two tiles that the scan may have without both ends of rays telling it.
+"""A gap between two tiles that both ends of rays do not reveal.
 
-Within some columns of the axis, and where nothing that turns is seen nearer to the axis, a gap
-moves both ends of all rays alike: it looks like another axis, half of its width aside. Only what
-single frames show across the border itself tells it. The same edges pass all borders there, a few
-frames later, so the other borders say what the evidence of a border is without a gap, by how much
-it scatters, and how much a gap would stand out. A gap that would stand out and does not is
-excluded; of what is not, the width stays in the column's sigma.
+Within some columns of the axis, and where no structure that turns is seen nearer to the
+axis, a gap moves both ends of all rays alike: it looks like another axis, half of its
+width aside. Only single frames across the border itself reveal it. The same edges pass
+all borders there, a few frames later, so the other borders give the evidence of a border
+without a gap, its scatter, and the visibility of a gap. A gap that would be visible and
+is not is excluded; the width of the others stays in the column's sigma.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 CHANCE: Final = 0.1
 """Probability that a panel has a gap at one of the columns where it is hidden; assumed."""
 TOLD_ODDS: Final = 100.0
-"""Odds of a gap from which it is told."""
+"""Odds of a gap from which it is reported."""
 WIDTHS_PX: Final = np.arange(0.25, 3.01, 0.25)
 """Widths of gaps that are tried [px]."""
 WIDTH_SPREAD_PX: Final = 1.0
@@ -40,7 +40,7 @@ WIDTH_SPREAD_PX: Final = 1.0
 BLURS_PX: Final = (0.0, 1.0)
 """Standard deviations over which a gap is smeared that are tried [px]."""
 SHARES: Final = np.array([0.3, 0.65, 1.0])
-"""Of the evidence that the model expects of a gap: what blurred edges may leave."""
+"""Shares of the gap's expected evidence that blurred edges may leave."""
 FREEDOM: Final = 8.0
 """Degrees of freedom of the scatter of evidence (Student): a third of the fewest borders."""
 LEAST_COLUMNS: Final = 14
@@ -50,9 +50,10 @@ EDGES: Final = 0.2
 MOST_EDGES: Final = 30_000
 """Places that are compared, at most."""
 LEAST_PX: Final = 0.3
-"""Where both ends of rays tell steps to a third of this, nothing is hidden [px]."""
+"""Width of gaps that are not hidden where both ends of rays determine steps to a third of
+it [px]."""
 SIGMAS: Final = 3.0
-"""Standard deviations of a step that are told."""
+"""Standard deviations from which a step is significant."""
 
 
 _LOG_PRIOR: Final = log_softmax(-0.5 * np.square(WIDTHS_PX / WIDTH_SPREAD_PX))[:, None]
@@ -60,7 +61,7 @@ _LOG_PRIOR: Final = log_softmax(-0.5 * np.square(WIDTHS_PX / WIDTH_SPREAD_PX))[:
 
 
 class HiddenGap(NamedTuple):
-    """What the scan leaves open about a gap beside its axis.
+    """A possible gap near the axis.
 
     Attributes:
         first, last: columns at which it may begin.
@@ -94,12 +95,12 @@ class Evidence:
     width: FloatArray
 
     def beside(self, more: FloatArray) -> Evidence:
-        """Add log likelihoods (w, c) of other data, which do not tell widths."""
+        """Add log likelihoods (w, c) of other data, which do not determine widths."""
         return Evidence(self.found + more, self.width)
 
     @property
     def ratio(self) -> FloatArray:
-        """Give the likelihood of a gap over none at each column, whatever its width, (c,)."""
+        """Likelihood of a gap over none at each column, for any width, (c,)."""
         return np.asarray(np.exp(np.minimum(logsumexp(self.found + _LOG_PRIOR, axis=0), 600.0)))
 
     @property
@@ -111,12 +112,13 @@ class Evidence:
 def hidden_gap(
     frames: Sequence[Float32Array], axis: float, profile: Profile | None, smoothing: float
 ) -> HiddenGap | None:
-    """Judge the gaps that both ends of rays do not tell; None: the images have too few columns.
+    """Judge the gaps that both ends of rays do not reveal; None for images of too few columns.
 
     Args:
         frames: line integrals of `tile_gap.averaged_rows`, some of a turn.
         axis: column of the axis, to a pixel or two.
-        profile: distances between both ends of rays; None: too little turns.
+        profile: distances between both ends of rays; None: too little of the object
+            turns.
         smoothing: sigma of the columns' smoothing in the profile [px].
     """
     reach = _hidden_radius(profile, smoothing) if profile else math.inf
@@ -153,7 +155,9 @@ def _gap_at(column: int, share: FloatArray) -> Gap:
 
 
 def _hidden_radius(profile: Profile, smoothing: float) -> float:
-    """Give the distance from the axis up to which both ends of rays do not tell steps [px]."""
+    """Return the distance from the axis up to which both ends of rays do not determine
+    steps [px].
+    """
     told = np.array([SIGMAS * profile.at(r).sigma < LEAST_PX for r in profile.radii.tolist()])
     inner = 2.0 * smoothing
     if not told.any():
@@ -162,7 +166,7 @@ def _hidden_radius(profile: Profile, smoothing: float) -> float:
 
 
 def _evidence_of_rays(columns: npt.NDArray[np.intp], axis: float, profile: Profile) -> FloatArray:
-    """Give log likelihoods over none, (w, c), by the steps that both ends of rays show."""
+    """Compute log likelihood ratios, (w, c), from the steps of both ends of rays."""
     beside = columns - 0.5 - axis
     steps = [profile.beside_axis(abs(b)) for b in beside.tolist()]
     width = np.array([step.width for step in steps]) * np.sign(beside)
@@ -172,7 +176,7 @@ def _evidence_of_rays(columns: npt.NDArray[np.intp], axis: float, profile: Profi
 
 
 def _evidence(images: FloatArray) -> Evidence:
-    """Judge gaps by what frames show.
+    """Judge gaps by single frames.
 
     Args:
         images: frames of columns about the axis, (n, rows, c + 2 SIDE - 1).
@@ -205,10 +209,11 @@ def _evidence(images: FloatArray) -> Evidence:
 
 
 class Judged(NamedTuple):
-    """What frames show of gaps of one width.
+    """Evidence of single frames for gaps of one width.
 
     Attributes:
-        found: logarithm of the likelihood of a gap over none beside other borders, (c,).
+        found: logarithm of the likelihood of a gap over none, compared with other
+            borders, (c,).
         gain: the same by the model of the differences alone, (c,).
         trust: part of that which its scatter justifies.
     """
@@ -219,7 +224,7 @@ class Judged(NamedTuple):
 
 
 def _beside_others(gains: FloatArray) -> Judged:
-    """Judge a gap at each border beside what other borders show.
+    """Judge a gap at each border by comparison with other borders.
 
     Args:
         gains: in log likelihood of a gap over none, by frame and border, (n, c).

@@ -5,12 +5,13 @@ axis divides into mirror images. The plane of source and axis maps rays to rays,
 same at a pixel and at its mirror image, at any cone angle and in the overlap of truncated scans.
 The map is a homography of the panel.
 
-The estimate is the root of Z' W r: r is the mean minus its mirror image, Z the slopes of a smoother
-copy, freed of what a flat field that is wrong by a polynomial of third degree would add. Noise in Z
-is also in r, which would shorten the steps and the sigma: what white noise of the variance seen
-in the mean (photons and flat field) contributes to Z' W r is subtracted. Edges that lie along rows
-or columns, and are so sharp that sampling puts them into steps, count less, and their steps are in
-the sigma: a flat end of an object, seen without blur, would be taken for an axis that is upright.
+The estimate is the root of Z' W r: r is the mean minus its mirror image, Z the slopes of
+a smoother copy, freed of what a flat field that is wrong by a polynomial of third degree
+would add. Noise in Z is also in r, which would shorten the steps and the sigma: the
+contribution to Z' W r of white noise with the variance seen in the mean (photons and flat
+field) is subtracted. Edges along rows or columns, so sharp that sampling puts them into
+steps, count less, and their steps are in the sigma: a flat end of an object, seen without
+blur, would be taken for an axis that is upright.
 """
 
 from __future__ import annotations
@@ -32,16 +33,16 @@ View = Callable[[FloatArray], FloatArray]
 LEVELS: Final = (64, 128, 256)
 """Columns over the smoothing's sigma, coarse to fine."""
 BLOCKS: Final = 16
-"""Blocks of rows, and of columns, whose scatter is compared with what the noise makes of it."""
+"""Number of blocks of rows, and of columns, whose scatter is compared with the noise's."""
 NEAR_PX: Final = 2.0
 """Edges along rows and columns are looked for in neighbourhoods of this width [px]."""
 SEEN: Final = 3.0
-"""And are some from so many standard deviations of the noise on."""
+"""Standard deviations of the noise from which edges count."""
 ROUNDS: Final = 15
 REACH: Final = 0.12
-"""The axis is looked for so far from its nominal column, as a share of the columns."""
+"""Largest distance of the axis from its nominal column, as a share of the columns."""
 OVERLAP: Final = 0.125
-"""Share of the columns that must have a mirror image."""
+"""Least share of the columns with a mirror image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +53,8 @@ class Symmetry:
         values: of the parameters.
         covariance: of them, with the priors.
         images: sigmas without the priors, (k,).
-        asymmetry: what is neither symmetric nor noise, relative to the structure of the mean.
+        asymmetry: the part that is neither symmetric nor noise, relative to the structure
+            of the mean.
         converged: whether the root was found.
     """
 
@@ -64,7 +66,8 @@ class Symmetry:
 
 
 def mirror_map(view: FloatArray) -> FloatArray:
-    """The homography (3, 3) from (column, row, 1) about the panel's centre to the mirror image's.
+    """Compute the homography (3, 3) from (column, row, 1) about the panel's centre to its
+    mirror image.
 
     Args:
         view: source, panel centre, u, v in a frame with the axis along z through its origin, (12,).
@@ -77,15 +80,15 @@ def mirror_map(view: FloatArray) -> FloatArray:
 
 
 def first_column(mean: FloatArray, nominal: float) -> tuple[float, float]:
-    """The column about which the mean is most symmetric.
+    """Find the column about which the mean is most symmetric.
 
     Args:
         mean: (rows, cols).
         nominal: the column to search about.
 
     Returns:
-        The column, and how much less symmetric (ratio of squares) the mean is about the next best
-        column; 0 where the best lies at the end of the search.
+        The column, and the ratio of the squares of the next best column's asymmetry to
+        its own; 0 if the best is at the end of the search.
     """
     cols = mean.shape[1]
     bands = np.stack([b.mean(axis=0) for b in np.array_split(mean, min(12, len(mean)))])
@@ -104,8 +107,9 @@ def first_column(mean: FloatArray, nominal: float) -> tuple[float, float]:
 
 
 def best_dip(cost: FloatArray, apart: float) -> tuple[int, float]:
-    """Where a cost is least, and by what factor less than in any other dip that is `apart`; 0 where
-    that is at an end."""
+    """Find the least cost, and the ratio to it of the next dip that is `apart`; 0 for a
+    minimum at an end.
+    """
     best, inner = int(cost.argmin()), cost[1:-1]
     dips = np.flatnonzero((inner <= cost[:-2]) & (inner <= cost[2:]) & np.isfinite(inner)) + 1
     if best not in dips:
@@ -118,7 +122,7 @@ def find_symmetry(
     turn: Turn, view: View, start: FloatArray, scales: FloatArray, priors: FloatArray,
     border: int | None = None, held_px: float | None = None,
 ) -> Symmetry:  # fmt: skip
-    """The plane of symmetry, coarse to fine.
+    """Estimate the plane of symmetry, coarse to fine.
 
     Args:
         turn: the frames' mean.
@@ -130,7 +134,7 @@ def find_symmetry(
         held_px: that width, where it is no parameter [px].
 
     Returns:
-        The estimate of the level that tells the first two parameters best.
+        The estimate of the level with the best first two parameters.
     """
     found = []
     values = start
@@ -174,7 +178,14 @@ class _Level:
         self.at = np.stack([a.ravel() for a in np.meshgrid(c, r)]).astype(np.float64)
 
     def solve(self, start: FloatArray) -> Symmetry:
-        """The root of the estimating equation from a start."""
+        """Find the root of the estimating equation.
+
+        Args:
+            start: of the parameters, (k,).
+
+        Returns:
+            The plane; not converged if the pixels with a mirror image are too few.
+        """
         values, k = start.copy(), len(start)
         found = Symmetry(values, np.full((k, k), np.inf), np.full(k, np.inf), math.inf, False)
         for _ in range(ROUNDS):
@@ -207,7 +218,12 @@ class _Level:
         return found
 
     def _mirrored(self, values: FloatArray, at: FloatArray) -> FloatArray:
-        """Mirror images (2, k) of pixels (2, k)."""
+        """Compute mirror images (2, k) of pixels, across a gap if there is one.
+
+        Args:
+            values: parameters.
+            at: (2, k) columns and rows.
+        """
         middle = (np.array(self.shape[::-1]) - 1)[:, None] / 2
         begins, gap = math.inf, 0.0
         if self.border is not None:
@@ -225,7 +241,9 @@ class _Level:
         return np.asarray(image)
 
     def _pairs(self, here: FloatArray) -> _MirrorPairs | None:
-        """The pixels with a mirror image on the panel, each pair once; None if they are too few."""
+        """Collect the pixels with a mirror image on the panel, each pair once; None if
+        they are too few.
+        """
         image = self._mirrored(here, self.at)
         room = 4.0 * self.sigma + self.margin
         inside = (image[0] > room) & (image[0] < self.shape[1] - 1 - room)
@@ -263,7 +281,9 @@ class _MirrorPairs:
         self.slopes = slopes - self.odd @ (self.to_odd @ slopes)
 
     def _polynomials(self, at: FloatArray) -> FloatArray:
-        """Errors of a flat field up to third degree that are odd about some column, (k, 4)."""
+        """Evaluate errors of a flat field up to third degree that are odd about some
+        column, (k, 4).
+        """
         x, y = (a / n - 0.5 for a, n in zip(at, self.level.shape[::-1], strict=True))
         return np.column_stack([x, x * y, x**3, x * y * y])
 
@@ -272,7 +292,7 @@ class _MirrorPairs:
         return np.asarray(self.own[which] - read_spline(self.level.soft[which], image))
 
     def score(self, values: FloatArray) -> FloatArray:
-        """The estimating equation."""
+        """Evaluate the estimating equation."""
         image = self.level._mirrored(values, self.at)
         rest = self.own[0] - read_spline(self.level.soft[0], image)
         both = 3.0 * self.level.sigma**2  # of the two smoothings
@@ -288,21 +308,26 @@ class _MirrorPairs:
         return np.asarray(rest - self.odd @ (self.to_odd @ rest))
 
     def _power(self) -> tuple[float, float]:
-        """Mean squares of the residual and of what noise would leave."""
+        """Compute mean squares of the residual and of noise alone."""
         white = (self.white[0] + self.white[1]) / (4.0 * math.pi * self.level.sigma**2)
         rest = float(np.average(np.square(self._rest()), weights=self.w))
         return rest, max(float(np.average(white, weights=self.w)), 1e-30)
 
     def asymmetry(self) -> float:
-        """As `Symmetry` has it."""
+        """Compute the asymmetry of `Symmetry`."""
         rest, noise = self._power()
         own = self.own[0] - np.average(self.own[0], weights=self.w)
         structure = max(float(np.average(own * own, weights=self.w)), 1e-30)
         return math.sqrt(max(rest - noise, 0.0) / structure)
 
     def covariance(self, inverse: FloatArray) -> FloatArray:
-        """Of the parameters: noise, widened where blocks scatter more or residuals are larger, and
-        the doubts."""
+        """Compute the covariance of the parameters from noise and doubts.
+
+        The noise is widened where blocks scatter more or residuals are larger.
+
+        Args:
+            inverse: (k, k) of the slopes of the equation.
+        """
         z = self.slopes * self.w[:, None]
         images = np.stack([self._spread(column) for column in z.T])
         noise = np.einsum("irc,jrc,rc->ij", images, images, self.level.pixel)
@@ -335,7 +360,12 @@ class _MirrorPairs:
         return np.asarray(covariance)
 
     def _spread(self, column: FloatArray) -> FloatArray:
-        """The image whose product with the mean is column' r (smoothing and reading, adjoint)."""
+        """Compute the image whose product with the mean is column' r (smoothing and
+        reading, adjoint).
+
+        Args:
+            column: (m,) of the pairs.
+        """
         rows, cols = self.level.shape
         out = np.zeros(rows * cols)
         for at, sign in ((self.at, 1.0), (self.image, -1.0)):
@@ -352,11 +382,14 @@ class _MirrorPairs:
 
 
 def sharpness(mean: FloatArray) -> float:
-    """How sharp edges along the rows are, times the root of their share in what changes from row to
-    row. 1 is that of pixels that are points, 0.4 of square ones without blur, 0 without edges.
+    """Measure how sharp edges along the rows are, times the root of their share in the
+    changes from row to row.
 
     Args:
         mean: line integrals, (rows, cols).
+
+    Returns:
+        1 for pixels that are points, 0.4 for square ones without blur, 0 without edges.
     """
     noise = np.full(mean.shape, np.median(_noise(mean)) / MEDIAN_OF_CHI_SQUARE)
     edges, left = _edges(mean, noise)
@@ -365,26 +398,29 @@ def sharpness(mean: FloatArray) -> float:
 
 
 def _noise(mean: FloatArray) -> FloatArray:
-    """Squares of second differences along rows, of which the noise's variance is the mean: photons,
-    flat field and rings, little of the object."""
+    """Compute squares of second differences along rows, whose mean is the noise's
+    variance: photons, flat field and rings, little of the object.
+    """
     change = np.diff(np.pad(mean, ((0, 0), (1, 1)), mode="reflect"), 2, axis=1)
     return np.asarray(np.square(change) / 6)
 
 
 def _steps(mean: FloatArray, noise: FloatArray) -> FloatArray:
-    """Standard deviation of what sampling does to edges along the rows, (rows, cols).
+    """Estimate the standard deviation of sampling errors at edges along the rows, (rows, cols).
 
-    Pixels that are points know an edge between two of them to half a row; blur and a pixel's size
-    spread it over several. An edge without blur has all frequencies alike, so what is left of
-    them at half the sampling's, relative to a quarter, tells what is left at the sampling's own.
+    Pixels that are points know an edge between two of them to half a row; blur and a
+    pixel's size spread it over several. An edge without blur has all frequencies alike,
+    so their attenuation at half the sampling's, relative to a quarter, gives the
+    attenuation at the sampling's own.
     """
     edges, left = _edges(mean, noise)
     return np.asarray(edges * left**2 / math.sqrt(6.0))
 
 
 def _edges(mean: FloatArray, noise: FloatArray) -> tuple[FloatArray, float]:
-    """How much of a quarter of the sampling's frequency edges along the rows have, (rows, cols),
-    and how much there is of half of it, relative to that."""
+    """Measure edges along the rows at a quarter of the sampling's frequency, (rows,
+    cols), and the ratio of half of it to that.
+    """
     change = np.diff(mean, axis=0, append=mean[-1:])
 
     def at(turn: float) -> FloatArray:
@@ -398,7 +434,7 @@ def _edges(mean: FloatArray, noise: FloatArray) -> tuple[FloatArray, float]:
 
 
 def read_spline(coefficients: FloatArray, at: FloatArray) -> FloatArray:
-    """An image at places (column, row) (2, k), by the coefficients of its cubic spline."""
+    """Read an image at places (column, row) (2, k), by the coefficients of its cubic spline."""
     return np.asarray(
         map_coordinates(coefficients, at[::-1], order=3, prefilter=False, mode="nearest")
     )

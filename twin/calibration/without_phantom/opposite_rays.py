@@ -1,17 +1,19 @@
 """Rays that two views see from opposite ends: the axis of half turns and of scans of few rows.
 
-The line through the sources of two views is a ray of both, whatever the object: where it falls on
-both panels, both must say the same. Of a whole turn every ray of the fan is one of these, of half a
-turn and the fan those of its first and last views. Beside the plane in which the source turns rays
-differ from their opposites by the little that they lean, so rows near it count as well.
+The line through the sources of two views is a ray of both, whatever the object: where it
+falls on both panels, both must have the same value. Of a full turn every ray of the fan
+is one of these, of half a turn and the fan those of its first and last views. Away from
+the plane in which the source turns rays differ from their opposites by the little that
+they lean, so rows near it count too.
 
-The estimate is the root of Z' W r: r is the difference of the two, Z its slopes, freed of what a
-flat field that is wrong by a polynomial would add. Noise is in Z too; what an image of noise alone
-gives is taken from Z' W Z, which would promise too much. Sums over all rays of a view, of a sector
-of views and of a few columns tell how much Z' W r scatters: noise, rings, jitter, sampling. Both
-ends of a ray also differ by what repeats along a wire (it hardens the beam, and is wider from one
-end than from the other): what of r is no noise is taken to be as one with Z within a patch of some
-columns and a sector of views, which is the most that it can do.
+The estimate is the root of Z' W r: r is the difference of the two, Z its slopes, freed of
+the error of a flat field that is wrong by a polynomial. Noise is in Z too; the product of
+an image of noise alone is subtracted from Z' W Z, which would promise too much. Sums over
+all rays of a view, of a sector of views and of a few columns show the scatter of Z' W r:
+noise, rings, jitter, sampling. Both ends of a ray also differ by structures that repeat
+along a wire (it hardens the beam, and is wider from one end than from the other): the
+part of r that is no noise is assumed to be in phase with Z within a patch of some columns
+and a sector of views, which is its largest possible effect.
 """
 
 from __future__ import annotations
@@ -41,15 +43,15 @@ MOST_PAIRS: Final = 30_000
 FEWEST_PAIRS: Final = 50
 ROUNDS: Final = 15
 LIFT: Final = 0.25
-"""Rows beside the source's plane count where a ray that leans and its opposite are so little apart
-at the edge of the field of view [px]."""
+"""Largest difference of a leaning ray and its opposite at the edge of the field of view,
+for rows outside the source's plane to count [px]."""
 EDGE: Final = 2
 """Rows around each view's that a cubic spline needs."""
 PATCH, SECTORS = 6.0, 24
 """Sigmas of the smoothing that a patch of like differences is wide, in columns of both ends, and
 sectors of the views that are as many patches."""
 CLEAN: Final = 0.5
-"""What the slopes are made of must be so many times noise, at least."""
+"""Least ratio to noise of the images behind the slopes."""
 
 
 class OppositeRays:
@@ -97,8 +99,9 @@ class OppositeRays:
             )
 
     def first(self) -> tuple[FloatArray, float]:
-        """The parameters about which rays agree best, and how much better than about the next best
-        column, as `first_column` has it."""
+        """Find the parameters about which rays agree best, and their ratio to the next
+        best column; see `first_column`.
+        """
         cols = self.shape[1]
         level = _Level(self, cols / LEVELS[0])
         some = self.pairs[:: -(-len(self.pairs) // (MOST_PAIRS // 10))]
@@ -109,7 +112,7 @@ class OppositeRays:
         return tried[best], ratio
 
     def find(self, values: FloatArray) -> Symmetry:
-        """The parameters, coarse to fine: the estimate of the level that tells the first best."""
+        """Estimate the parameters, coarse to fine, at the level with the best first one."""
         found = []
         for part in LEVELS:
             found.append(_Level(self, max(self.shape[1] / part, 1.0)).solve(values))
@@ -120,8 +123,15 @@ class OppositeRays:
     def _places(
         self, values: FloatArray, pairs: npt.NDArray[np.intp]
     ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-        """Columns and rows (2, 2, q) where each view of a pair shows the other's source, and
-        whether both panels have it."""
+        """Locate the other's source in each view of pairs.
+
+        Args:
+            values: parameters, (k,).
+            pairs: of views, (q, 2).
+
+        Returns:
+            Columns and rows (2, 2, q), and whether both panels contain them (q,).
+        """
         rows, out = self.views(values), np.empty((2, 2, len(pairs)))
         middle = (np.array(self.shape[::-1]) - 1) / 2
         for side in (0, 1):
@@ -144,7 +154,7 @@ class _Level:
         self.images, self.alone = (self._soft(i) for i in (rays.frames, rays.noise))
 
     def _soft(self, images: Float32Array) -> FloatArray:
-        """Coefficients of a spline through all smoothed images, one below the other."""
+        """Compute coefficients of a spline through all smoothed images, one below the other."""
         soft = gaussian_filter(images, (0, self.sigma, self.sigma))
         for axis in (1, 2):
             soft = spline_filter1d(soft, axis=axis, output=np.float32)
@@ -154,7 +164,7 @@ class _Level:
     def read(
         self, image: FloatArray, places: FloatArray, pairs: npt.NDArray[np.intp]
     ) -> FloatArray:
-        """What both views of pairs show, (2, q, lifts)."""
+        """Read the values of both views of pairs, (2, q, lifts)."""
         rows = self.rays.frames.shape[1]
         row = places[:, 1, :, None] + self.rays.lifts - self.rays.top
         row = np.clip(row, 0, rows - 1) + EDGE + pairs.T[:, :, None] * (rows + 2 * EDGE)
@@ -162,7 +172,9 @@ class _Level:
         return read_spline(image, np.stack([column, row]))
 
     def disagreement(self, values: FloatArray, pairs: npt.NDArray[np.intp]) -> float:
-        """Mean square of the differences over that of what is seen; infinite for few rays."""
+        """Compute the mean square of the differences over that of the images; infinite
+        for few rays.
+        """
         places, inside = self.rays._places(values, pairs)
         if inside.sum() < FEWEST_PAIRS // 2:
             return math.inf
@@ -170,7 +182,14 @@ class _Level:
         return float(np.square(both[0] - both[1]).mean() / max(both.var(), 1e-30))
 
     def solve(self, start: FloatArray) -> Symmetry:
-        """The root of the estimating equation from a start."""
+        """Find the root of the estimating equation.
+
+        Args:
+            start: of the parameters, (k,).
+
+        Returns:
+            The estimate; not converged with few pairs.
+        """
         rays, values, k = self.rays, start.copy(), len(start)
         found = Symmetry(values, np.full((k, k), np.inf), np.full(k, np.inf), math.inf, False)
         for _ in range(ROUNDS):
@@ -209,7 +228,16 @@ class _Level:
     def _equations(
         self, values: FloatArray, pairs: npt.NDArray[np.intp]
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Differences (m,) and their slopes (k, m), both of noise alone, and weights."""
+        """Compute differences and slopes of pairs, and those of noise.
+
+        Args:
+            values: parameters, (k,).
+            pairs: of views, (q, 2).
+
+        Returns:
+            Differences (m,) and their slopes (k, m), both of noise alone, and weights
+            (m,).
+        """
         places = self.rays._places(values, pairs)[0]
         both = self.read(self.images, places, pairs).reshape(2, -1)
         w = 1.0 / np.exp(np.minimum(both, DARKEST)).sum(axis=0)
@@ -237,8 +265,8 @@ class _Level:
         self, slope: FloatArray, excess: FloatArray, w: FloatArray,
         pairs: npt.NDArray[np.intp], values: FloatArray,
     ) -> float:  # fmt: skip
-        """Give what differences that are no noise add to a sum of them times slopes, at most
-        within a patch (Cauchy-Schwarz), at random from patch to patch.
+        """Bound the sum of slopes times differences that are no noise: in phase within a
+        patch (Cauchy-Schwarz), at random from patch to patch.
 
         Args:
             slope: of the differences with the column, (m,).
@@ -260,8 +288,16 @@ class _Level:
     def _scatter(
         self, slopes: FloatArray, rest: FloatArray, pairs: npt.NDArray[np.intp], values: FloatArray
     ) -> FloatArray:
-        """Covariance of sums over all rays of weighted slopes (k, m) times differences (m,), and of
-        what the noise of the flat field, which all frames share, adds to them."""
+        """Compute the covariance of sums over all rays of slopes times differences.
+
+        It contains the noise of the flat field, which all frames share.
+
+        Args:
+            slopes: weighted, (k, m).
+            rest: differences, (m,).
+            pairs: of views, (q, 2).
+            values: parameters, (k,).
+        """
         rays, of_pairs = self.rays, (len(slopes), len(pairs), -1)
         columns = rays._places(values, pairs)[0][:, 0]
         sums = (slopes * rest).reshape(of_pairs).sum(axis=2)

@@ -36,7 +36,7 @@ def sum_planes(
         inwards: (q, 2) horizontal unit vector from the line through the sources to the axis.
         edges: (q, k + 1) dz over distance along `inwards` of the planes between the bins.
         columns: (n, 2) first column of a view that the object can reach, and the one after them.
-        integrals: (q, 2, k) what g integrates to, written.
+        integrals: (q, 2, k) integrals of g, written.
         ones: the same of 1 instead of g, written.
     """
     cols, rows, planes = sums.shape[1], sums.shape[2] - 1, edges.shape[1]

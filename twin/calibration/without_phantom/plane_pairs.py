@@ -1,9 +1,9 @@
-"""How well pairs of views agree on integrals over planes through both their sources.
+"""Agreement of pairs of views on integrals over planes through both their sources.
 
-The integrals are those of `plane_kernels.py`. Nothing is assumed of their errors but that those of
-frames, distances between views, and heights far apart are their own: what a sum of squares is
-known to follows from how much its parts scatter. `source_row.py` and `frame_shifts.py` say what
-follows: the row of the plane in which the source turns, and shifts of single frames.
+The integrals are those of `plane_kernels.py`. Errors are only assumed to be independent
+between frames, distances between views, and heights far apart: the uncertainty of a sum
+of squares follows from the scatter of its parts. `source_row.py` and `frame_shifts.py`
+derive the row of the plane in which the source turns, and shifts of single frames.
 """
 
 from __future__ import annotations
@@ -29,24 +29,25 @@ Views = Callable[[FloatArray], ConeVec]
 APART: Final = (0.2, 0.3, 0.38, 0.43, 0.455, 0.47, 0.48)
 """Distances of the two views of a pair, in turns."""
 CLEAR: Final = 1.05
-"""The line through two sources keeps so far from the axis, relative to the object's radius."""
+"""Least distance of the line through two sources from the axis, relative to the object's
+radius."""
 AIR: Final = 0.005
-"""Of the mean's largest value, what is taken for air (assumed)."""
+"""Largest share of the mean's largest value that counts as air (assumed)."""
 NOISE: Final = 7.0
-"""And so many standard deviations of the mean's noise."""
+"""Standard deviations of the mean's noise above which it is no air."""
 LEVELS: Final = ((1, 0), (2, 0), (4, 0), (1, 8), (2, 8), (4, 8), (2, 20), (4, 20))
-"""Bins of planes, and pairs within so many degrees, whose differences are added before they are
+"""Bins of planes, and degrees between pairs, whose differences are added before they are
 squared."""
 ROWS: Final = 2
 """Rows to a bin."""
 FEWEST_BINS: Final = 4
-"""In which a pair must be seen whole to count."""
+"""Least number of complete bins of a pair that counts."""
 FEWEST_PAIRS: Final = 0.25
 """Share of the pairs that count, at least (assumed)."""
 SECTORS: Final = 18
-"""Of the turn, whose sums are compared."""
+"""Number of sectors of the turn whose sums are compared."""
 BLOCKS: Final = 12
-"""Of heights, whose sums are compared."""
+"""Number of blocks of heights whose sums are compared."""
 
 
 class PlanePairs:
@@ -57,7 +58,7 @@ class PlanePairs:
         mean: over the turn, not binned.
         factor: of the binning.
         views: to the geometry of the frames as they were before.
-        start: the arguments of `views` about which the others lie.
+        start: the arguments of `views` about which others are tried.
 
     Raises:
         NotIdentifiableError: no two views have sources whose connection is clear of the object.
@@ -117,7 +118,7 @@ class PlanePairs:
     def integrals(
         self, at: FloatArray, rows: FloatArray | None = None, sums: Float32Array | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Integrals of both views of each pair, (q, 2, k), and what 1 comes to, (q, k).
+        """Compute integrals of both views of each pair, (q, 2, k), and those of 1, (q, k).
 
         Args:
             at: arguments of `views`; the planes rise with the panel's height.
@@ -132,7 +133,8 @@ class PlanePairs:
         return found, ones.mean(axis=1)
 
     def costs(self, at: FloatArray, sums: Float32Array | None = None) -> FloatArray:
-        """Sums of squared differences, without what is alike in all bins (air that is not 0).
+        """Compute sums of squared differences, without offsets common to all bins (air
+        that is not 0).
 
         Args:
             at: arguments of `views`.
@@ -163,22 +165,22 @@ class PlanePairs:
         return np.hstack([pairs, blocks.reshape(len(LEVELS), -1)])
 
     def scales(self, costs: FloatArray) -> FloatArray:
-        """1 / usual cost of pairs as far apart as each one, laid out as `costs`."""
+        """Compute 1 / usual cost of pairs as far apart as each one, laid out as `costs`."""
         pairs = costs[:, : len(self.pairs)]
         usual = np.add.reduceat(pairs, self.starts, axis=1) / self.sizes
         scale = np.where(usual > 0, 1.0 / np.maximum(usual, 1e-300), 0.0)
         return np.hstack([np.repeat(scale, self.sizes, axis=1), np.repeat(scale, BLOCKS, axis=1)])
 
     def total(self, parts: FloatArray) -> FloatArray:
-        """Sums over the pairs of what is laid out as `costs`."""
+        """Sum parts, laid out as `costs`, over the pairs."""
         return np.asarray(parts[..., : len(self.pairs)].sum(axis=-1))
 
     def blocks(self, parts: FloatArray) -> FloatArray:
-        """What `costs` has behind the pairs, (..., distances, BLOCKS)."""
+        """Return the part of `costs` after the pairs, (..., distances, BLOCKS)."""
         return parts[..., len(self.pairs) :].reshape(*parts.shape[:-1], -1, BLOCKS)
 
     def spread(self, parts: FloatArray, blocks: bool = False) -> FloatArray:
-        """Standard deviations of `total`.
+        """Estimate standard deviations of `total`.
 
         Args:
             parts: (..., q + distances * BLOCKS).
@@ -195,7 +197,7 @@ class PlanePairs:
         return np.asarray(np.sqrt(worst))
 
     def noise(self, random: np.random.Generator) -> Float32Array:
-        """Images that are noise as large as that of the frames, laid out as `sums`."""
+        """Draw images of noise as large as that of the frames, laid out as `sums`."""
         out = np.zeros_like(self.sums)
         np.cumsum(noise_like(np.diff(self.sums, axis=2), random), axis=2, out=out[:, :, 1:])
         return out
@@ -203,7 +205,12 @@ class PlanePairs:
     def _valid(
         self, here: FloatArray, border: tuple[FloatArray, FloatArray, FloatArray]
     ) -> npt.NDArray[np.bool_]:
-        """(q, k) bins of planes that leave the panel of neither view where it sees the object."""
+        """Mark bins of planes that leave the panel of neither view within the object, (q, k).
+
+        Args:
+            here: (n, 12) views.
+            border: places at the object's upper end, lower end and sides, see `_support`.
+        """
         edges, step = self.heights, float(np.diff(self.heights).mean())
         valid = np.ones((len(self.pairs), len(edges) - 1), dtype=bool)
         upper, lower, sides = border
@@ -230,9 +237,9 @@ class PlanePairs:
 
 
 def noise_like(images: Float32Array, random: np.random.Generator) -> Float32Array:
-    """Noise as large as that of images (n, cols, rows).
+    """Draw noise as large as that of images (n, cols, rows).
 
-    Its variance grows as 1 / exp(-g), as that of counted photons; how large it is is the median
+    Its variance grows as 1 / exp(-g), as that of counted photons; its size is the median
     over all pixels of second differences along rows, so mostly of air.
     """
     power = np.exp(np.minimum(images, DARKEST))
@@ -243,7 +250,7 @@ def noise_like(images: Float32Array, random: np.random.Generator) -> Float32Arra
 
 
 def spread(parts: FloatArray, pairs: npt.NDArray[np.intp], n: int) -> FloatArray:
-    """Standard deviations of sums over pairs (q, 2) of n frames of parts (..., q).
+    """Estimate standard deviations of sums over pairs (q, 2) of n frames of parts (..., q).
 
     Pairs that share a frame, or one of a sector, are not independent: of squares of the sums over
     all that do, those that count pairs twice are taken away. The largest of three counts.
@@ -264,7 +271,9 @@ def spread(parts: FloatArray, pairs: npt.NDArray[np.intp], n: int) -> FloatArray
 def without(
     part: FloatArray, whole: FloatArray, used: npt.NDArray[np.bool_] | None = None
 ) -> FloatArray:
-    """`whole` (..., k) where it is used, less what is like `part`; 0 where hardly any is."""
+    """Subtract from `whole` (..., k), where it is used, its part along `part`; 0 with
+    hardly any used.
+    """
     if used is not None:
         used = used & (used.sum(axis=-1) >= FEWEST_BINS)[..., None]
         part, whole = part * used, whole * used
@@ -273,7 +282,9 @@ def without(
 
 
 def _columns(here: FloatArray, cols: int, radius: float) -> npt.NDArray[np.intp]:
-    """First column of each view that the object can reach and the one after the last, (n, 2)."""
+    """Return the first column of each view that the object can reach and the one after
+    the last, (n, 2).
+    """
     i = np.arange(cols) - (cols - 1) / 2
     x, y = (here[:, 3 + a, None] - here[:, a, None] + i * here[:, 6 + a, None] for a in (0, 1))
     passing = np.abs(here[:, 0, None] * y - here[:, 1, None] * x) / np.hypot(x, y)
@@ -284,8 +295,17 @@ def _columns(here: FloatArray, cols: int, radius: float) -> npt.NDArray[np.intp]
 def _support(
     frames: Float32Array, mean: FloatArray, view: FloatArray
 ) -> tuple[float, tuple[FloatArray, FloatArray, FloatArray]]:
-    """How far the object reaches from the axis [mm], and places (column, row) about the panel's
-    centre at its upper end, its lower end and its sides where it does not see air."""
+    """Measure the extent of the object.
+
+    Args:
+        frames: line integrals (n, rows, cols).
+        mean: (rows, cols).
+        view: (12,) of the first frame.
+
+    Returns:
+        Its radius about the axis [mm], and places (column, row) about the panel's centre
+        at its upper end, its lower end and its sides where the image shows no air.
+    """
     rows, cols = mean.shape
     full = np.zeros((rows, cols), dtype=bool)
     # What is thin and far from the axis hardly shows in the mean.

@@ -1,10 +1,10 @@
 """The row in which the source turns: the panel's height at which planes through two sources agree.
 
-A panel that stands higher than it is said to gives one view of a pair planes that lean to one side
-and the other view such that lean to the other. The panel's height is that at which all pairs agree
-best. The sum of squares is followed by wide steps: noise is in its derivatives too, so that the
-usual normal equations would promise too much and step too short. What noise alone does to that sum
-is seen in images of noise.
+A panel that is higher than stated gives one view of a pair planes that lean to one side
+and the other view planes that lean to the other. The panel's height is that at which all
+pairs agree best. The sum of squares is followed by wide steps: noise is in its
+derivatives too, so that the usual normal equations would promise too much and step too
+short. The effect of noise alone on that sum is measured in images of noise.
 """
 
 from __future__ import annotations
@@ -19,18 +19,19 @@ from flexdt.twin.errors import NotIdentifiableError
 from flexdt.twin.geometry.conventions import FloatArray
 
 GRID: Final = 25
-"""Heights that are tried first."""
+"""Number of heights that are tried first."""
 SURE: Final = 2.0
-"""Standard deviations by which the best of them must be better than any that is not beside it."""
+"""Standard deviations by which the best of them must be better than any that is not its
+neighbour."""
 BENT: Final = 2.5
-"""Standard deviations of its own by which the minimum must be one."""
+"""Least curvature of the minimum, in its own standard deviations."""
 LEFT: Final = 0.05
-"""Share of the curvature that is left without any two neighbouring blocks of heights, at least."""
+"""Least share of the curvature left without any two neighbouring blocks of heights."""
 ROUNDS: Final = 8
 FREE_ROUNDS: Final = 3
 """In which the level may change."""
 NOISY: Final = 4
-"""Steps to either side of the minimum at which noise alone is looked at."""
+"""Steps to either side of the minimum at which noise alone is evaluated."""
 ELSEWHERE: Final = "the views agree about as well with the source's plane at another row"
 
 
@@ -47,16 +48,17 @@ class _Bowl(NamedTuple):
 def find_height(
     fine: PlanePairs, coarse: PlanePairs, reach: float, random: np.random.Generator
 ) -> tuple[float, float]:
-    """The panel's height above where it was said to be, and its standard deviation [px].
+    """Estimate the panel's height above the stated one, and its standard deviation [px].
 
     Args:
         fine: pairs of views.
         coarse: the same binned twice as much, for the search.
-        reach: heights are tried so far from the start [px].
+        reach: largest distance of trial heights from the start [px].
         random: for the images of noise.
 
     Raises:
-        NotIdentifiableError: the disagreement is least nowhere, or about as small elsewhere.
+        NotIdentifiableError: the disagreement has no minimum, or another one about as
+            small.
     """
     up = np.eye(len(fine.start))[0]
     bowl, at, h = _settle(fine, coarse, np.linspace(-reach, reach, GRID), up, random)
@@ -89,7 +91,16 @@ def _settle(
     fine: PlanePairs, coarse: PlanePairs, grid: FloatArray, up: FloatArray,
     random: np.random.Generator,
 ) -> tuple[_Bowl, float, float]:  # fmt: skip
-    """The minimum, its place, and the half width of the steps that found it [px].
+    """Find the minimum by steps.
+
+    Args:
+        fine, coarse: pairs of views.
+        grid: trial heights [px].
+        up: direction of the height among the arguments.
+        random: for the images of noise.
+
+    Returns:
+    The minimum, its place, and the half width of the steps that found it [px].
 
     Raises:
         NotIdentifiableError: as `find_height`.
@@ -113,7 +124,13 @@ def _settle(
 def _first(
     pairs: PlanePairs, grid: FloatArray, up: FloatArray, random: np.random.Generator
 ) -> float:
-    """The height on a grid at which the views agree best.
+    """Find the height on a grid at which the views agree best.
+
+    Args:
+        pairs: of views.
+        grid: trial heights [px].
+        up: direction of the height among the arguments.
+        random: for the images of noise.
 
     Raises:
         NotIdentifiableError: as `find_height`.
@@ -143,6 +160,7 @@ def _first(
 
 
 def _bowl(pairs: PlanePairs, at: float, h: float, up: FloatArray) -> _Bowl:
+    """Evaluate slope, curvature and sigma of all levels' costs about a height."""
     low, mid, high = (pairs.costs(pairs.start + (at + s * h) * up) for s in (-1, 0, 1))
     scale = pairs.scales(mid)
     slopes, bends = (high - low) * scale / (2 * h), (high + low - 2 * mid) * scale / h**2

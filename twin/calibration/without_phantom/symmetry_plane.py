@@ -1,7 +1,7 @@
 """The plane of symmetry of a circular scan, from its mean over a turn or from opposite rays.
 
-First the column about which the images are most symmetric, then all parameters of the plane, and
-what their uncertainty is where the images, a gap between tiles and steps of the images are known.
+First the column about which the images are most symmetric, then all parameters of the
+plane, and their uncertainty with a gap between tiles and steps of the images.
 """
 
 from __future__ import annotations
@@ -42,22 +42,25 @@ MOST_VIEWS: Final = 1440
 LEAST_RATIO: Final = 1.5
 """How much less symmetric the mean must be about any other column (ratio of squares; assumed)."""
 MOST_ASYMMETRY: Final = 0.05
-"""Of the mean's structure, what may be neither symmetric nor noise (assumed)."""
+"""Largest part of the mean's structure that is neither symmetric nor noise (assumed)."""
 MOST_COLUMN: Final = 2.0
 """Largest sigma of the column that is offered [px]."""
 MOST_ROLL: Final = 0.5
 """Largest sigma of the roll that is offered [deg]."""
 FLOOR_DEG: Final = 0.001
-"""Added to the roll's sigma: what beam hardening and lag do to the mean (assumed) [deg]."""
+"""Added to the roll's sigma: the effect of beam hardening and lag on the mean (assumed)
+[deg]."""
 APART_SIGMAS: Final = 4.0
 """From here on a difference between the mean and opposite rays is a warning."""
 LEAST_APART_PX: Final = 0.1
-"""A smaller one is none, however well both are known: no volume shows it."""
+"""Least difference of the columns to report, however well both are known [px]: no volume
+shows less."""
 
 
 @dataclass(frozen=True, eq=False)
 class FirstColumn:
-    """The column about which the images are most symmetric, and where the fit of the plane begins.
+    """The column about which the images are most symmetric, and the start of the fit of
+    the plane.
 
     Attributes:
         turn: the frames of a full turn; None without one.
@@ -66,8 +69,8 @@ class FirstColumn:
         scales: change of each that moves the image's ends by about a pixel, (k,).
         priors: standard deviation of each, inf for none, (k,).
         column: most symmetric column [px].
-        ratio: how much less symmetric the images are about any other column.
-        preface: what errors begin with: why there is no full turn, or which gap there is.
+        ratio: of the next best column's asymmetry to its own.
+        preface: beginning of errors: the reason for no full turn, or the gap.
     """
 
     turn: Turn | None
@@ -81,12 +84,12 @@ class FirstColumn:
 
 
 class OppositeColumn(NamedTuple):
-    """What opposite rays say of the column beside the mean of a full turn.
+    """The column by opposite rays, compared with that of the mean of a full turn.
 
     Attributes:
         apart_px: their column less that of the mean.
         sigma_px: standard deviation of their column from leaving out sectors of the turn.
-        mean_sigma_px: that of the column of the mean before they are looked at.
+        mean_sigma_px: that of the column of the mean before the comparison.
     """
 
     apart_px: float
@@ -95,7 +98,7 @@ class OppositeColumn(NamedTuple):
 
     @property
     def floor_px(self) -> float:
-        """Give what the mean's sigma lacks, as far as opposite rays know it."""
+        """Part missing in the mean's sigma, as far as opposite rays show it [px]."""
         if not math.isfinite(self.sigma_px):
             return self.mean_sigma_px
         share = self.mean_sigma_px / math.hypot(self.mean_sigma_px, self.sigma_px)
@@ -103,7 +106,7 @@ class OppositeColumn(NamedTuple):
 
     @property
     def warning(self) -> str | None:
-        """Say that the two disagree; None where they do not."""
+        """Warning that the two disagree; None where they agree."""
         sigma = math.hypot(self.mean_sigma_px, self.sigma_px)
         if not abs(self.apart_px) > max(APART_SIGMAS * sigma, LEAST_APART_PX):
             return None
@@ -116,7 +119,7 @@ class OppositeColumn(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SymmetryPlane:
-    """The plane of symmetry, with what else the images show of the scan.
+    """The plane of symmetry, with other results of the images.
 
     Attributes:
         scan: the scan; its images have the gap closed.
@@ -125,12 +128,12 @@ class SymmetryPlane:
         covariance: of them, with the priors, (k, k).
         images_rad: standard deviations of roll and yaw by the images alone, (2,).
         priors_rad: the same before the images, (2,).
-        told: whether the images tell roll and yaw, (2,).
+        told: whether the images determine roll and yaw, (2,).
         column_sigma_px: standard deviation of the column.
         gap: between two tiles of the panel.
         panel: the distortion that was undone, the gap in it.
-        opposite: what opposite rays of a full turn say of the column.
-        hidden: what is left open about a gap beside the axis.
+        opposite: the column by opposite rays of a full turn.
+        hidden: a possible gap near the axis.
     """
 
     scan: CircularScan
@@ -181,7 +184,7 @@ def find_plane(
 
 
 def _first_column(scan: CircularScan, random: np.random.Generator) -> FirstColumn:
-    """Search for the axis in the mean over a full turn, without one in opposite rays."""
+    """Search for the axis in the mean over a full turn, or else in opposite rays."""
     try:
         angle = scan.base.angle_scale * scan.poses.angle
         turn = read_turn(scan.image, angle, scan.present, source_row=scan.source_row())
@@ -205,6 +208,7 @@ def _first_in_turn(scan: CircularScan, turn: Turn) -> FirstColumn:
 
 
 def _first_in_rays(scan: CircularScan, no_turn: str, random: np.random.Generator) -> FirstColumn:
+    """Search for the axis in opposite rays; `no_turn` begins the messages of errors."""
     scales, given = scan.scales, scan.priors
     scales[1] = 2 / scan.shape[1]
     priors = np.array(
@@ -224,8 +228,12 @@ def _first_in_rays(scan: CircularScan, no_turn: str, random: np.random.Generator
 def _require_one_column(scan: CircularScan, first: FirstColumn) -> None:
     """Check that the images are symmetric about one column.
 
+    Args:
+        scan: gives the shape.
+        first: the best column.
+
     Raises:
-        NotIdentifiableError: about none within reach, or about another one as well.
+        NotIdentifiableError: no column within reach, or another one as good.
     """
     reach = REACH * scan.shape[1]
     refuse_if(
@@ -252,7 +260,7 @@ def _gap(scan: CircularScan, first: FirstColumn, panel: Panel | None) -> GapFoun
 
 
 def _closes(found: Symmetry, gap: Gap) -> bool:
-    """Say whether the plane of symmetry tells the width, and leaves nothing of a gap."""
+    """Check whether the plane of symmetry determines the width, and leaves no gap."""
     if gap.beside_axis:
         return False
     sigma = float(np.sqrt(found.covariance[-1, -1]))
@@ -261,7 +269,7 @@ def _closes(found: Symmetry, gap: Gap) -> bool:
 
 
 def _with_gap(first: FirstColumn, gap: Gap) -> FirstColumn:
-    """Make the width of a gap the last parameter, where the plane tells it."""
+    """Make the width of a gap the last parameter, where the plane determines it."""
     if gap.beside_axis:
         return replace(first, preface=f"{gap.text}; ")
     return replace(
@@ -311,7 +319,15 @@ def _plane(
     gap_found: GapFound,
     panel: Panel | None,
 ) -> SymmetryPlane:
-    """Put together what was found, with the uncertainty that the fit does not contain."""
+    """Collect the results, with the uncertainty that the fit does not contain.
+
+    Args:
+        scan: the scan.
+        first: start of the fit.
+        found: its result.
+        gap_found: the gap, and what is hidden.
+        panel: the distortion that was undone, or None.
+    """
     turn, scales = first.turn, first.scales
     gap, hidden = gap_found
     values, covariance = found.values.copy(), found.covariance.copy()
@@ -350,7 +366,17 @@ def _opposite_column(
     covariance: FloatArray,
     gap: Gap | None,
 ) -> OppositeColumn | None:
-    """Compare the column of the mean with that of opposite rays; None without a full turn."""
+    """Compare the column of the mean with that of opposite rays.
+
+    Args:
+        scan: the scan.
+        first: start of the fit.
+        values, covariance: of the parameters, (k,) and (k, k).
+        gap: between two tiles, or None.
+
+    Returns:
+        None without a full turn.
+    """
     if first.turn is None:
         return None
     rays = ConjugateRays.of(scan, first.turn)
@@ -380,7 +406,7 @@ def _beside_rows(scan: CircularScan, rays: OppositeRays, roll_rad: float) -> flo
 def _keep_roll(
     values: FloatArray, covariance: FloatArray, roll_rad: float, sigma_rad: float
 ) -> None:
-    """Put the roll in force in place of what few rows say of it, which was up to six sigma off."""
+    """Replace the roll by the one in force, since few rows gave values up to six sigma off."""
     values[1], covariance[1], covariance[:, 1] = roll_rad, 0.0, 0.0
     covariance[1, 1] = sigma_rad**2
 
@@ -407,6 +433,11 @@ def _opposite_rays(
     random: np.random.Generator,
 ) -> OppositeRays:
     """Collect the rays near the plane of the source that two views see from opposite ends.
+
+    Args:
+        scan: the scan.
+        start, scales, known: of the parameters, see `OppositeRays`.
+        random: for the image of noise.
 
     Raises:
         NotIdentifiableError: there are hardly any.

@@ -1,15 +1,16 @@
-"""What single frames of a turn show of a gap between two tiles of the panel.
+"""A gap between two tiles of the panel in single frames of a turn.
 
-What lies in a gap is missing: beyond it everything appears nearer by its width, and the columns
-beside it differ as columns do that are further apart. How much columns differ with their distance
-is seen in the frames themselves, everywhere else. Where edges of the turning object pass a border,
-the differences of neighbouring columns about it are compared with what they would be with a gap of
-each width: the likelihood of normal differences, each row of each frame at its own scale. The
-outline of the object looks like a gap, too, where its edges turn back, but it does so on both sides
-of the axis: the gain at a border's mirror image is subtracted twice. A gap is in all frames, and a
-few that fit well prove nothing: what frames scatter by is subtracted as well. What stays the same
-in all frames (rings, a wrong flat field) is left out, and so are borders near columns that show
-nothing.
+Structures in a gap are missing: beyond it everything appears nearer by its width, and the
+columns next to it differ as columns do that are further apart. The change of columns with
+their distance is seen in the frames themselves, everywhere else. Where edges of the
+turning object pass a border, the differences of neighbouring columns about it are
+compared with those expected for a gap of each width: the likelihood of normal
+differences, each row of each frame at its own scale. The outline of the object looks like
+a gap, too, where its edges turn back, but it does so on both sides of the axis: the gain
+at a border's mirror image is subtracted twice. A gap is in all frames, and a few that fit
+well prove nothing: the scatter of the frames is subtracted too. Structures that are the
+same in all frames (rings, a wrong flat field) are left out, and so are borders near
+columns without information.
 """
 
 from __future__ import annotations
@@ -30,24 +31,27 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.panel import Border, Panel
 
 SIDE: Final = 4
-"""Columns on each side of a border that are looked at."""
+"""Number of columns on each side of a border that are compared."""
 WIDTHS: Final = np.arange(0.0, 4.01, 0.1)
-"""Widths of gaps that are tried [px]."""
+"""Trial widths of gaps [px]."""
 ROWS, FRAMES = 48, 96
 """Rows that a frame is averaged to, and frames that are looked at, where there are more."""
 EDGES: Final = 0.05
-"""Part of all places that is compared, those with most change: edges. Noise says nothing."""
+"""Part of all places that is compared, those with most change: edges. Noise has no
+information."""
 LEAST_VARIANCE: Final = 0.02
-"""Of the largest variance of differences: what the model of normal differences may lack."""
+"""Least variance of differences, as a share of the largest: possible error of the normal
+model."""
 EVIDENCE, STANDS_OUT = 24.0, 5.0
 """Gain in log likelihood from which on there is a gap, and times the gain at any other border. Of
 93 drawn scans without a gap one had both, of 69 with one of 0.5 to 2 px 65 (`align_faults.py`)."""
 
 
 class Gap(NamedTuple):
-    """Between two tiles: the first column beyond it, and how wide it is, with sigma [px].
+    """A gap between two tiles: the first column beyond it, and its width, with sigma [px].
 
-    Beside the axis a gap moves both ends of all rays alike, so only single frames tell its width.
+    Near the axis a gap moves both ends of all rays alike, so only single frames determine
+    its width.
     """
 
     column: int
@@ -57,14 +61,16 @@ class Gap(NamedTuple):
 
     @property
     def text(self) -> str:
-        """What is seen of it, in words."""
+        """Description of the gap, in words."""
         return (
             f"from column {self.column} on everything appears nearer by {self.width:.2f} +- "
             f"{self.sigma:.2g} px, as behind a gap between two tiles of the panel"
         )
 
     def panel(self, shape: tuple[int, int], undone: Panel | None = None) -> Panel:
-        """The panel of images (rows, cols) with this gap, beside what is undone in them already."""
+        """Make the panel of images (rows, cols) with this gap, in addition to the
+        distortion undone already.
+        """
         one = undone or Panel.flat(shape)
         at = np.array([self.column - 0.5, (shape[0] - 1) / 2])
         border = Border(0, float((at + one.shift(at))[0]))
@@ -73,19 +79,19 @@ class Gap(NamedTuple):
 
 
 def averaged_rows(image: Float32Array) -> Float32Array:
-    """A frame with about ROWS rows, if it has more."""
+    """Average a frame to about ROWS rows, if it has more."""
     return binned_mean(image, (-(-len(image) // ROWS), 1))
 
 
 def local_gaps(
     frames: Sequence[Float32Array], axis: float, closed: Sequence[float] = ()
 ) -> list[Gap]:
-    """Give the border, or the two, whose likelihood of a gap stands out.
+    """Return the border, or the two, whose likelihood of a gap is significant.
 
     Args:
         frames: line integrals of `averaged_rows`, some of a turn.
         axis: column of the axis, to a pixel or two.
-        closed: columns of borders beside which the images are filled in.
+        closed: columns of borders next to which the images are filled in.
     """
     stack = np.asarray(frames, dtype=np.float64)
     if stack.shape[2] < 8 * SIDE:
@@ -133,7 +139,8 @@ def local_sigma(width: FloatArray | float) -> FloatArray:
 
 
 def _gains(edges: FloatArray, place: npt.NDArray[np.intp], shape: tuple[int, int]) -> FloatArray:
-    """What gaps of all widths gain at each border over none, less what frames scatter by, (w, b).
+    """Compute gains of gaps of all widths at each border over none, less the scatter of
+    frames, (w, b).
 
     Args:
         edges: differences of neighbouring columns, (k, 2 SIDE - 1).

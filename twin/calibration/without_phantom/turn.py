@@ -1,8 +1,9 @@
-"""One pass over the frames of a full turn: their mean, and how far it may be from the true one.
+"""One pass over the frames of a full turn: their mean, and its possible errors.
 
-Over a full turn the mean projection is that of a body of revolution. What would spoil it is looked
-for here: frames that are repeated, gaps between angles, and a step between neighbours, which after
-a drift is the one between the last frame and the first; what slips during the scan leaves both.
+Over a full turn the mean projection is that of a body of revolution. Its possible faults
+are looked for here: frames that are repeated, gaps between angles, and a step between
+neighbours, which after a drift is the one between the last frame and the first; a slip
+during the scan leaves both.
 """
 
 from __future__ import annotations
@@ -27,23 +28,23 @@ Image = Callable[[int], Float32Array]
 THUMB_COLUMNS: Final = 64
 """Columns of the small copies in which frames are compared, at least where there are as many."""
 DARKEST: Final = 8.0
-"""Line integral above which the noise is taken for that of this one."""
+"""Largest line integral in the model of noise; above it the noise is constant."""
 MEDIAN_OF_CHI_SQUARE: Final = 0.4549
 """Of one degree of freedom."""
 WHITE: Final = 3.0
-"""Standard deviations of white noise's correlation up to which neighbouring pixels are not alike.
-From twice that on they are."""
+"""Standard deviations of white noise's correlation up to which neighbouring pixels are
+independent. From twice that on they are not."""
 LOST: Final = 2.5
-"""A frame may be missing where two differ by more than so many times what is usual there: with one
-missing it is about four."""
+"""Ratio of a difference of frames to the usual one above which a frame may be missing:
+with one missing it is about four."""
 STEPS: Final = 5.0
-"""A step between neighbours is one when it is so many times the usual spread (assumed)."""
+"""Least ratio of a step between neighbours to the usual spread (assumed)."""
 CLEAR: Final = 1.5
-"""And so many times the next largest elsewhere: faces that lie along the beam leave several."""
+"""Least ratio of it to the next largest elsewhere: faces along the beam leave several."""
 FEWEST: Final = 24
-"""Directions of which a mean is taken, at least."""
+"""Least number of directions for a mean."""
 BACK: Final = 0.3
-"""Two steps whose sum is smaller than so much of one are one to and fro (assumed)."""
+"""Sum of two steps relative to one below which they are one to and fro (assumed)."""
 WIDEST_GAP: Final = 4.5
 """Largest gap between neighbouring angles, relative to the usual one: three frames missing."""
 BAND, BAND_PART, GROUPS = 12, 20, 7
@@ -57,14 +58,14 @@ GAP_IMAGES: Final = 6
 
 @dataclass(frozen=True, eq=False)
 class Turn:
-    """What the frames of a turn come to.
+    """The frames of a turn, combined.
 
     Attributes:
         mean: mean line integrals over the angle, (rows, cols).
-        doubts: (k, rows, cols). The first is half of what every second frame says otherwise than
-            those between, so the noise of `mean` and more than its lack of views. Each of the
-            others is what leaving out frames beside a gap, as many as are missing in it, changes,
-            or what a repeated frame may.
+        doubts: (k, rows, cols). The first is half the difference of every second frame
+            from those between, so the noise of `mean` and more than its lack of views.
+            Each of the others is the change by leaving out frames next to a gap, as many
+            as are missing in it, or by a repeated frame.
         noise: relative variance of a pixel of `mean`, (rows, cols).
         used: indices of the frames in the mean.
         samples: some of these frames, their rows averaged: `averaged_rows`.
@@ -72,8 +73,8 @@ class Turn:
         band_rows: middle row of each group.
         band_frames: frame of each of these views.
         repeated: indices of frames left out as repeated.
-        step_px: (columns, rows) by which the images step at most between neighbouring frames; 0
-            where no step is significant or none can be told.
+        step_px: (columns, rows) by which the images step at most between neighbouring
+            frames; 0 where no step is significant or separable.
         step_after: the frame before that step.
     """
 
@@ -162,7 +163,9 @@ def _groups(rows: int, cols: int, middle: float) -> list[tuple[int, int]]:
 
 
 def _require_turn(angle: FloatArray) -> tuple[FloatArray, float]:
-    """Gaps behind each of the sorted angles (mod a turn), and the usual one [rad]."""
+    """Check that angles cover a turn; return the gaps after each sorted angle, and the
+    usual one [rad].
+    """
     around = angle % (2 * np.pi)
     gaps = np.diff(around, append=around[:1] + 2 * np.pi)
     own = gaps[gaps > 1e-6]
@@ -180,7 +183,13 @@ def _require_turn(angle: FloatArray) -> tuple[FloatArray, float]:
 
 
 def _coefficients(angle: FloatArray, gaps: FloatArray, usual: float) -> FloatArray:
-    """Of each frame (sorted by angle) in the mean and in the doubts, (1 + k, n)."""
+    """Compute the weight of each frame in the mean and in the doubts, (1 + k, n).
+
+    Args:
+        angle: sorted, (n,) [rad].
+        gaps: after each, (n,) [rad].
+        usual: of the gaps [rad].
+    """
     n = len(angle)
     keep = np.ones(n, dtype=bool)
     even = np.arange(n) % 2 == 0
@@ -198,7 +207,9 @@ def _coefficients(angle: FloatArray, gaps: FloatArray, usual: float) -> FloatArr
 
 
 def _weights(angle: FloatArray, keep: npt.NDArray[np.bool_]) -> FloatArray:
-    """Of the trapezoidal rule on the circle for those that are kept, 0 for the others."""
+    """Compute weights of the trapezoidal rule on the circle for the kept angles, 0 for
+    the others.
+    """
     around = angle[keep] % (2 * np.pi)
     gaps = np.diff(around, append=around[:1] + 2 * np.pi)
     out = np.zeros(len(angle))
@@ -207,7 +218,7 @@ def _weights(angle: FloatArray, keep: npt.NDArray[np.bool_]) -> FloatArray:
 
 
 def _thumb(image: Float32Array) -> Float32Array:
-    """Means over square blocks; what is left over at the ends is left out."""
+    """Average over square blocks; incomplete blocks at the ends are left out."""
     factor = max(1, round(image.shape[1] / THUMB_COLUMNS))
     if min(image.shape) < 2 * factor:
         raise NotIdentifiableError.instead(
@@ -218,11 +229,18 @@ def _thumb(image: Float32Array) -> Float32Array:
 
 
 def _repeated(views: Float32Array, gaps: FloatArray) -> tuple[list[int], list[int]]:
-    """Places of frames that show what the one before shows although the stage turned, and of those
-    that differ from it as if one were missing.
+    """Find frames that repeat the one before although the stage turned, and those after a
+    missing one.
 
-    Two exposures of the same differ by noise alone, in which neighbouring pixels are not alike;
-    what a turn changes spreads over several.
+    Two exposures of the same differ by noise alone, in which neighbouring pixels are
+    independent; the change by a turn spreads over several.
+
+    Args:
+        views: (n, rows, cols), sorted by angle.
+        gaps: after each, (n,) [rad].
+
+    Returns:
+        Places of both kinds.
     """
     soft = gaussian_filter(views, (0, 2, 2))  # less noise: a copy may have been exposed anew
     rest = soft - np.roll(soft, 1, axis=0)
@@ -249,18 +267,28 @@ def _repeated(views: Float32Array, gaps: FloatArray) -> tuple[list[int], list[in
 
 
 def _neighbours_correlation(image: FloatArray) -> float:
-    """Correlation of neighbouring pixels along rows or columns, whichever is larger; 0 of noise."""
+    """Compute the correlation of neighbouring pixels along rows or columns, the larger
+    one; 0 of noise.
+    """
     own = image - image.mean()
     along = [(own[1:] * own[:-1]).mean(), (own[:, 1:] * own[:, :-1]).mean()]
     return float(max(along)) / max(float(np.square(own).mean()), 1e-30)
 
 
 def _step(views: Float32Array, gaps: FloatArray, first: int) -> tuple[tuple[float, float], int]:
-    """The largest step (columns, rows) between neighbours and the place before it; `first` is where
-    the frame stands that was taken first. No step where none is significant, or none can be told.
+    """Find the largest step between neighbours.
 
     Each frame is compared with the third-order interpolation of its four neighbours on the circle.
     A shift d between frame i - 1 and frame i leaves -d/2 in one of them and +d/2 in the other.
+
+    Args:
+        views: (n, rows, cols), sorted by angle.
+        gaps: after each, (n,) [rad].
+        first: place of the frame that was taken first.
+
+    Returns:
+        The step (columns, rows) and the place before it; 0 if no step is significant or
+        separable.
     """
     n = len(views)
     soft = gaussian_filter(views, (0, 1, 1))
@@ -298,6 +326,6 @@ def _step(views: Float32Array, gaps: FloatArray, first: int) -> tuple[tuple[floa
 
 
 def _far(n: int, place: int) -> npt.NDArray[np.bool_]:
-    """(n,) places on the circle that are no near neighbours of one."""
+    """Mark places (n,) on the circle that are no near neighbours of one."""
     apart = np.abs(np.arange(n) - place)
     return np.asarray(np.minimum(apart, n - apart) > 2)

@@ -1,4 +1,4 @@
-"""What planes through two sources tell of a full turn: the source's row, and shifts of frames."""
+"""The source's row and shifts of frames of a full turn, from planes through two sources."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
 
 COLUMNS: Final = 256
-"""Frames are binned to about so many columns where planes are looked at."""
+"""Number of columns to which frames are binned for planes."""
 MOST_FRAMES: Final = 360
 """For the row, of more frames than this every second, third and so on is used."""
 MOST_SHIFTS: Final = 2000
-"""Frames whose shifts can be asked for."""
+"""Largest number of frames whose shifts are estimated."""
 FLOOR_OF_ROW: Final = 0.1
-"""The row's sigma is this at least: what sampling does (assumed) [px of the binned frames]."""
+"""Least sigma of the row: the effect of sampling (assumed) [px of the binned frames]."""
 SHARP_ROWS: Final = 2.0
-"""What sampling does to edges along rows as sharp as those of points (assumed) [px]."""
+"""Effect of sampling on edges along rows as sharp as those of points (assumed) [px]."""
 STEP_OF_ROW: Final = 10.0
 """A step of the images may move the row so many times as far (assumed)."""
 
 
 class TurnPlanes:
-    """What planes through two sources tell once the plane of symmetry is known.
+    """Estimates from planes through two sources, once the plane of symmetry is known.
 
     Args:
         image, poses: as of `align_turn`.
@@ -65,8 +65,9 @@ class TurnPlanes:
         self.stack: Float32Array | None = None
 
     def _of(self, at: FloatArray) -> Offsets:
-        """Offsets for the panel's height above what is said [px], three doubts of the plane of
-        symmetry and those of SDD and pitch [sigma]."""
+        """Return offsets for the panel's height above the stated one [px], three doubts
+        of the plane of symmetry and those of SDD and pitch [sigma].
+        """
         given = self.offsets(self.values + self.doubts @ at[1:4])
         return replace(
             given,
@@ -76,7 +77,7 @@ class TurnPlanes:
         )
 
     def _pairs(self, stride: int, coarser: int = 1) -> PlanePairs:
-        """Pairs of every frame, or of every second, third and so on."""
+        """Make pairs of every frame, or of every second, third and so on."""
         frames = self.sorted[::stride]
         if self.stack is None or len(self.stack) != len(frames):
             images = [binned_mean(self.image(i), self.factor) for i in frames.tolist()]
@@ -89,10 +90,16 @@ class TurnPlanes:
         return PlanePairs(stack, self.turn.mean, coarser * self.factor, views, np.zeros(6))
 
     def row(self, random: np.random.Generator) -> tuple[Offsets, AlignEstimate]:
-        """Offsets with the panel's height, and the row of the source's plane.
+        """Estimate the panel's height and the row of the source's plane.
+
+        Args:
+            random: for the images of noise.
+
+        Returns:
+            Offsets with the height, and the row [px].
 
         Raises:
-            NotIdentifiableError: the images do not tell it.
+            NotIdentifiableError: the images do not determine it.
         """
         stride = -(-len(self.sorted) // MOST_FRAMES)
         fine, coarse = (self._pairs(stride, coarser) for coarser in (1, 2))
@@ -114,10 +121,11 @@ class TurnPlanes:
         return self._of(at), AlignEstimate(float(row), sigma, "px")
 
     def motion(self, corrected: Offsets, random: np.random.Generator) -> Motion:
-        """Shifts of single frames as shifts of the sample, dO_x and dO_y.
+        """Estimate shifts of single frames as shifts of the sample, dO_x and dO_y.
 
         Raises:
-            NotIdentifiableError: the images do not tell them, or there are too many frames.
+            NotIdentifiableError: the images do not determine them, or there are too many
+                frames.
         """
         n = len(self.sorted)
         refuse_if(n > MOST_SHIFTS, f"{n} frames; shifts are looked for in up to {MOST_SHIFTS}")
