@@ -32,7 +32,7 @@ from flexdt.twin.geometry.poses import Poses
 LOOSE_PX = 0.6
 """Root mean square distance of spots from their beads above which panel and axis are loosened."""
 LOOSE = 15.0
-"""Factor on the priors of the offsets in `loose`."""
+"""Factor on the priors of panel and axis then."""
 WIDE_PX, NARROW_PX = (120.0, 60.0, 40.0), (25.0, 15.0, 10.0)
 """Gates of the rounds from all start angles, and of those from the promising ones."""
 FINALISTS = 4

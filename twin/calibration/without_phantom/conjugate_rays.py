@@ -39,7 +39,7 @@ SECTORS: Final = 24
 SMOOTHING: Final = 128.0
 """Columns over the smoothing's sigma, which is one column at least."""
 VIEWS_OVER: Final = 4.0
-"""Width of the panel's turn between views over the smoothing's sigma, at most."""
+"""Columns times the step between views [rad] over the smoothing's sigma, at most."""
 EDGE: Final = 8
 """Views repeated at both ends for the splines over the angle."""
 ROUNDS, NEAR = 4, 0.05
