@@ -37,11 +37,11 @@ from flexdt.twin.script.grammar import own_name
 from flexdt.twin.script.log_fit import Fit, fit_machine
 from flexdt.twin.script.parse import read_script
 
-MOST_NEXT: Final = 3
+MAX_NEXT_SCANS: Final = 3
 """Largest number of proposed scans."""
-ENOUGH: Final = 3
+MIN_DURATIONS: Final = 3
 """Durations of a kind of command from which its range is estimated (`docs/machine-fit.md`)."""
-NEXT: Final = {
+NEXT_SCANS: Final = {
     "ordinary": ("a full turn of any object with structure", "fly --frames 721"),
     "magnified": ("the same at another magnification", "fly --frames 721 --sod {sod:.0f}"),
     "later": ("the same on another day", "fly --frames 721"),
@@ -49,7 +49,7 @@ NEXT: Final = {
     "recorded": ("a scan with `flexdt follow ADDRESS --record FILE` beside it", "calibration"),
 }
 """Kind of scan -> its description, and the options of `flexdt script new --kind`."""
-NEARER: Final = 0.6
+NEARER_SOD_RATIO: Final = 0.6
 """Source-object distance of the scan at another magnification over its own: clearly
 different, and the sample still clears the source in most scanners."""
 MACHINE_FILE: Final = "machine.toml"
@@ -105,8 +105,9 @@ class Commissioned(NamedTuple):
             "not_judged": (Question._fields, [*self.questions]),
             "next": (
                 ("scan", "settles", "command"),
-                [(NEXT[kind][0], n, make + NEXT[kind][1].format(sod=NEARER * sod))
-                 for kind, n in votes.most_common(MOST_NEXT)],
+                [(NEXT_SCANS[kind][0], n,
+                  make + NEXT_SCANS[kind][1].format(sod=NEARER_SOD_RATIO * sod))
+                 for kind, n in votes.most_common(MAX_NEXT_SCANS)],
             ),
         }  # fmt: skip
 
@@ -176,8 +177,8 @@ def commission(folders: Sequence[Path], traffic: Path | None, read_log: ReadLog)
     offsets = tells.zero_offsets(scans, machine, d.profile_of(shipped))
     unseen = [f"limits of {n}" for n in machine.axes if fit is None or n not in fit.axes]
     times = {k: x.n for k, x in machine.timing.spread.items()} if fit else {}
-    unseen += [f"time of {k}" for k in machine.timing.kinds if times.get(k, 0) < ENOUGH]
-    why = f"no executed script tells it, or fewer than {ENOUGH} commands of one"
+    unseen += [f"time of {k}" for k in machine.timing.kinds if times.get(k, 0) < MIN_DURATIONS]
+    why = f"no executed script tells it, or fewer than {MIN_DURATIONS} commands of one"
     rest = [*offsets.questions, *(Question(what, why, "recorded") for what in unseen)]
     findings = [
         *_refused(machine, offsets.profile),

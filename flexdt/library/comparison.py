@@ -38,7 +38,7 @@ TOLERANCE_PX: Final = 0.5
 FIGURES: Final = ("rms_px", "max_px", "image_rms")
 """Figures of one correction: rms and largest residual of the beads [px], rms of the
 difference images."""
-SHOWN: Final = 4
+SHOWN_FRAMES: Final = 4
 """Number of frames with difference images."""
 
 
@@ -74,7 +74,7 @@ def compare_folder(
     phantom: str | Phantom,
     tolerance_px: float = TOLERANCE_PX,
     *,
-    shown: int = SHOWN,
+    shown: int = SHOWN_FRAMES,
 ) -> Comparison:
     """Compare a data set with the twin.
 

@@ -42,9 +42,9 @@ from flexdt.twin.plausibility.scan_geometry import radian_findings
 from flexdt.twin.projection.volume import Grid, Volume
 from flexdt.twin.signatures import File
 
-OWN: Final = OWN_ENDINGS[0]
+OWN_ENDING: Final = OWN_ENDINGS[0]
 """File ending of flexdt's own document."""
-CUBE: Final = 1e-6
+MAX_CUBE_DIFFERENCE: Final = 1e-6
 """Relative difference of a voxel's edges up to which it is a cube."""
 
 
@@ -190,7 +190,7 @@ def to_leap(cone_vec: ConeVec, like: object, rows_up: bool) -> Any:
         return model
     blank = _voxels(like)
     x, y, z = blank.voxel_xyz
-    if max(x, y, z) - min(x, y, z) > CUBE * x:
+    if max(x, y, z) - min(x, y, z) > MAX_CUBE_DIFFERENCE * x:
         asked = f"LEAP: voxels of {x:g} x {y:g} x {z:g} mm"
         raise ExchangeError.instead(asked, [x, y, z], "cubes, in a modular beam")
     if not model.set_volume(*blank.shape[::-1], x, z, *blank.center_mm):
@@ -235,7 +235,7 @@ def load(
     """Read a geometry from a file; see `ConeVec.load`."""
     path = Path(file)
     pitch = None if pixel is None else _pair(pixel)
-    if format is None and path.suffix.lower() == OWN:
+    if format is None and path.suffix.lower() == OWN_ENDING:
         return _value(_json(path, Given(shape, pitch)))
     chosen = format or _format(path, [form for form in FORMATS.values() if form.read])
     return _value(import_geometry(path, chosen, Given(shape, pitch)))
@@ -255,7 +255,7 @@ def _json(path: Path, given: Given) -> ScanGeometry:
 def save(cone_vec: ConeVec, file: File, format: str | None) -> None:
     """Write a geometry to a file; see `ConeVec.save`."""
     path = Path(file)
-    if format is None and path.suffix.lower() == OWN:
+    if format is None and path.suffix.lower() == OWN_ENDING:
         save_geometry(_scan(cone_vec), path)
     else:
         chosen = format or _format(path, [form for form in FORMATS.values() if form.write])
@@ -263,11 +263,13 @@ def save(cone_vec: ConeVec, file: File, format: str | None) -> None:
 
 
 def _format(path: Path, among: Iterable[Format]) -> str:
-    """Return the name of the format with a file's ending; `OWN` is flexdt's."""
-    by_ending = {ending: form.name for form in among for ending in form.endings if ending != OWN}
+    """Return the name of the format with a file's ending; `OWN_ENDING` is flexdt's."""
+    by_ending = {
+        ending: form.name for form in among for ending in form.endings if ending != OWN_ENDING
+    }
     found = by_ending.get(path.suffix.lower())
     if found is None:
-        endings = [OWN, *by_ending]
+        endings = [OWN_ENDING, *by_ending]
         raise ExchangeError(
             f"{path.name}: the ending of a geometry file is one of {', '.join(endings)}",
             {"asked": path.suffix, "allowed": endings},

@@ -66,7 +66,7 @@ from flexdt.twin.signatures import public
 BATCH_BYTES: Final = 64 << 20
 """Path lengths in memory at a time."""
 MOST_POINTS: Final = 1024
-FILLED: Final = 0.8
+FILLED_SHARE: Final = 0.8
 """Part of the panel's range that the open beam fills with the default exposure."""
 DOUBTED_PX: Final = 0.25
 """Difference of the spot's blur over a sample from which it is worth a warning [pixels]."""
@@ -367,7 +367,7 @@ def _attenuation(body: Volume | Phantom) -> npt.NDArray[Any] | None:
 
 
 def _chosen_ms(panel: Detector, camera: CameraSettings, beam_e_per_ms: float) -> float:
-    """Compute the exposure that fills `FILLED` of the panel's range with the open beam [ms].
+    """Compute the exposure that fills `FILLED_SHARE` of the panel's range with the open beam [ms].
 
     Raises:
         LimitError: the panel's offset leaves no range to fill.
@@ -375,7 +375,7 @@ def _chosen_ms(panel: Detector, camera: CameraSettings, beam_e_per_ms: float) ->
     # A panel that is half full in the dark has little range left: say so, not an odd exposure.
     require_within("offset_counts", panel.offset_counts, 0.0, 0.5 * panel.full_scale, "counts")
     dark_e_per_ms = panel.dark_charge(camera) / 1000.0
-    range_e = (FILLED * panel.full_scale - panel.offset_counts) * panel.gain(camera)
+    range_e = (FILLED_SHARE * panel.full_scale - panel.offset_counts) * panel.gain(camera)
     low, high = EXPOSURES_MS
     return min(max(range_e / (beam_e_per_ms + dark_e_per_ms), low), high)
 

@@ -20,7 +20,7 @@ from flexdt.twin.calibration.detect.windows import (
 from flexdt.twin.calibration.frame_source import Frames
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
-SURE = 5.0
+MIN_LAG_SIGMAS = 5.0
 """Sigmas from which lag is removed. The beads must agree: structures that turn with the
 object, ahead of one bead or behind it, look like lag of that bead alone."""
 SEEN_AT_LEAST = 0.002
@@ -43,7 +43,7 @@ class Lag:
     @property
     def seen(self) -> bool:
         """It is there beyond doubt."""
-        return self.part > max(SURE * self.sigma, SEEN_AT_LEAST)
+        return self.part > max(MIN_LAG_SIGMAS * self.sigma, SEEN_AT_LEAST)
 
 
 def lag_of(

@@ -21,7 +21,7 @@ from flexdt.twin.calibration.identify import Identification, Search, attempt, id
 from flexdt.twin.calibration.outcome import Calibration
 from flexdt.twin.calibration.request import CalibrationRequest
 
-MANY: Final = 0.6
+MAX_BEAD_SHARE: Final = 0.6
 """Largest part of a frame's spots that are beads for it to be tried at another frame's
 angle."""
 NEAR_PX: Final = 3.0
@@ -110,7 +110,7 @@ def _numbers(
     counts = np.array([len(d) for d in detections])
     if found is not None:
         seen = (found.index >= 0).sum(axis=1)
-        if not ((counts >= 2) & (seen <= MANY * counts)).any():
+        if not ((counts >= 2) & (seen <= MAX_BEAD_SHARE * counts)).any():
             return None
     n = len(counts)
     parts = [slice(0, n // 2), slice(n // 2, n), slice(n // 4, n - n // 4)]

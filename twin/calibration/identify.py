@@ -31,13 +31,13 @@ from flexdt.twin.geometry.poses import Poses
 
 LOOSE_PX = 0.6
 """Root mean square distance of spots from their beads above which panel and axis are loosened."""
-LOOSE = 15.0
+LOOSE_FACTOR = 15.0
 """Factor on the priors of panel and axis then."""
 WIDE_PX, NARROW_PX = (120.0, 60.0, 40.0), (25.0, 15.0, 10.0)
 """Gates of the rounds from all start angles, and of those from the promising ones."""
-FINALISTS = 4
+MAX_FINALISTS = 4
 """Number of hypotheses finished on all frames."""
-RIVAL = 25.0
+MAX_RIVAL_EXCESS = 25.0
 """Largest excess of a rival's squared residuals over the best hypothesis's, in units of
 its variance."""
 
@@ -186,18 +186,21 @@ def identify(
     hypotheses = [_Hypothesis(base + i * turn, math.inf, 0) for i in range(how.starts)]
     # All start angles get the wide rounds; only the promising ones the narrow.
     hypotheses = _best_first(_rounds(problem, some, h, WIDE_PX) for h in hypotheses)
-    hypotheses = hypotheses[: max(FINALISTS, how.starts // 2)]
+    hypotheses = hypotheses[: max(MAX_FINALISTS, how.starts // 2)]
     hypotheses = _best_first(_rounds(problem, some, h, NARROW_PX) for h in hypotheses)
     whole = build_problem(
         np.full((len(poses), len(model), 2), np.nan), model, poses, free=SIX, shape=shapes
     )
-    finals = _best_first(_finish(whole, scene, h, how) for h in _different(hypotheses)[:FINALISTS])
+    finals = _best_first(
+        _finish(whole, scene, h, how) for h in _different(hypotheses)[:MAX_FINALISTS]
+    )
     if finals and (loose or finals[0].loss > LOOSE_PX**2):
         # A rolled panel or a leaning axis looks like another phantom: only loose priors tell. Where
         # the six explain the spots, this is not needed.
         whole = build_problem(
             np.full((len(poses), len(model), 2), np.nan), model, poses, free=SIX, shape=shapes,
-            start=start, priors={n: LOOSE * w for n, w in ASSUMED.items()} | dict(loose or {}),
+            start=start,
+            priors={n: LOOSE_FACTOR * w for n, w in ASSUMED.items()} | dict(loose or {}),
         )  # fmt: skip
         finals = _best_first(_finish(whole, scene, h, how, wide_px=60.0) for h in finals)
     return _report(whole, scene, finals, shapes, start, how)
@@ -510,7 +513,7 @@ def _report(
             continue
         # Difference of squared residuals in units of the best one's variance.
         excess = (h.loss - best.loss) * max(int(np.minimum(shadows.counts, len(model)).sum()), 1)
-        if excess < RIVAL * max(spread, 0.02) ** 2:
+        if excess < MAX_RIVAL_EXCESS * max(spread, 0.02) ** 2:
             rivals.append(_at(problem, h.x, start))
     view = visible_beads(model, poses, shapes, geometry) & ~touching
     return Identification(

@@ -33,11 +33,11 @@ ANYWHERE_MM: Final = 1e3
 GATES_PX: Final = (12.0, 5.0, 3.0)
 """Largest distance of a spot from a marker's projection: in the first rough geometry,
 after one fit, after two [px]."""
-SHARE: Final = 0.3
+MIN_SEEN_SHARE: Final = 0.3
 """Least share of the frames with a spot of a marker."""
-BASES: Final = 6
+BASE_FRAMES: Final = 6
 """Number of frames whose spots are paired with those of others."""
-SCORED: Final = 60
+MAX_SCORED_FRAMES: Final = 60
 """Largest number of frames in which candidates are compared."""
 
 
@@ -83,7 +83,7 @@ def link(
         cone = poses.cone_vec(at)
         index = assign(cone.project_points(places, shape), points, counts, gate)
         often = np.count_nonzero(index >= 0, axis=0)
-        enough = often >= max(3, SHARE * np.count_nonzero(counts))
+        enough = often >= max(3, MIN_SEEN_SHARE * np.count_nonzero(counts))
         index, places = index[:, enough], places[enough]
         if gate != GATES_PX[-1] and enough.sum() >= 3:
             tracks = _picked(points, index)
@@ -168,7 +168,7 @@ def _found(points: FloatArray, counts: Index, cone: ConeVec, shape: tuple[int, i
     pitch = np.median(np.linalg.norm(cone.u, axis=1))
     gap = GATES_PX[0] * pitch
     candidates = []
-    bases = usable[np.linspace(0, len(usable) - 1, BASES).astype(int)]
+    bases = usable[np.linspace(0, len(usable) - 1, BASE_FRAMES).astype(int)]
     for i in np.unique(bases).tolist():
         for step in (len(usable) // 4, len(usable) // 3):
             j = int(usable[(int(np.searchsorted(usable, i)) + max(step, 1)) % len(usable)])
@@ -183,7 +183,7 @@ def _found(points: FloatArray, counts: Index, cone: ConeVec, shape: tuple[int, i
             near = np.linalg.norm(p - q, axis=2) < gap
             candidates.append(((p + q) / 2)[near])
     places = np.concatenate(candidates)
-    some = usable[np.linspace(0, len(usable) - 1, min(len(usable), SCORED)).astype(int)]
+    some = usable[np.linspace(0, len(usable) - 1, min(len(usable), MAX_SCORED_FRAMES)).astype(int)]
     spots = points[some].copy()
     with np.errstate(invalid="ignore"):
         predicted = cone[some].project_points(places, shape)
@@ -194,7 +194,7 @@ def _found(points: FloatArray, counts: Index, cone: ConeVec, shape: tuple[int, i
         close = nearest < GATES_PX[0]
         score = close.sum(axis=0) - (np.where(close, nearest, 0.0).sum(axis=0) / GATES_PX[0]) / 2
         k = int(np.argmax(score))
-        if close[:, k].sum() < max(3, SHARE * len(some)):
+        if close[:, k].sum() < max(3, MIN_SEEN_SHARE * len(some)):
             break
         frames = np.flatnonzero(close[:, k])
         taken = np.full((len(some), 1, 2), np.nan)

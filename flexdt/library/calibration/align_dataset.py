@@ -24,7 +24,7 @@ from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.scanner.state import NamedCorrection
 
-MOST: Final = 0.1
+MAX_STEP_SHARE: Final = 0.1
 """Largest step of a panel that is no tiling, as a share of the panel's shorter side."""
 
 
@@ -143,7 +143,7 @@ def _at_rest(data: ImageSet) -> tuple[Callable[[int], Float32Array], Poses]:
     poses = data.poses
     aside = poses.detector - poses.detector.mean(axis=0)
     steps = np.stack([(aside * side).sum(1) / (side**2).sum(1) for side in (poses.v, poses.u)], 1)
-    if not STANDS < np.abs(steps).max() < MOST * min(data.shape):
+    if not STANDS < np.abs(steps).max() < MAX_STEP_SHARE * min(data.shape):
         return data.line_integrals, poses
     still = poses.detector - steps[:, :1] * poses.v - steps[:, 1:] * poses.u
     moved = replace(poses, detector=still)

@@ -439,7 +439,7 @@ def _finite(value: float) -> float | None:
 SHARP_PX: Final = 0.25
 """Largest sigma of the axis column with which a volume is as sharp as its voxels [px]; assumed: a
 column that is off by d makes an edge d pixels wider."""
-ELSEWHERE: Final = 0.7
+SECOND_SOD_RATIO: Final = 0.7
 """Source-object distance of a second placement over the first's: nearer, where offsets
 act differently."""
 
@@ -520,7 +520,7 @@ def next_commands(result: Calibration, data: Sequence[str], phantom: str) -> lis
     if sharp and not limited:
         return use
     sod = float(result.scans[0].poses.sod.mean())
-    places = f"--position {sod:.0f} --position {ELSEWHERE * sod:.0f}"
+    places = f"--position {sod:.0f} --position {SECOND_SOD_RATIO * sod:.0f}"
     closer = [
         f"flexdt script new --kind calibration {places} --out two-places.txt",
         f"flexdt calibrate PLACE-1 PLACE-2 --phantom {shlex.quote(phantom)}",

@@ -8,7 +8,7 @@ import numpy as np
 
 from flexdt.library.datasets.image_set import ImageSet
 
-STEPPED: Final = "step scan"
+STEP_SCAN: Final = "step scan"
 """Name in the scanner's settings text of a scan that stops for every image."""
 
 
@@ -27,7 +27,7 @@ def exposure_share(data: ImageSet) -> float | None:
     document = data.document
     if document is None or "smooth" not in document.model_fields_set:
         settings = data.settings
-        stepped = settings is not None and settings.scan_type == STEPPED
+        stepped = settings is not None and settings.scan_type == STEP_SCAN
         return 0.0 if stepped else None
     if not document.smooth:
         return 0.0

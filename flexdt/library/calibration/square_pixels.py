@@ -18,7 +18,7 @@ from flexdt.twin.dataset.dataset_errors import DatasetMissingError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 
-UNEQUAL = 1e-3
+MAX_SIDE_DIFFERENCE = 1e-3
 """Relative difference of the pixel's sides above which rows are resampled."""
 
 
@@ -26,7 +26,7 @@ def squared(data: Images) -> Images:
     """Return `data`, with rows resampled to the columns' pitch where pixels are not square."""
     poses = data.poses
     ratio = float(np.median(np.linalg.norm(poses.v, axis=1) / np.linalg.norm(poses.u, axis=1)))
-    if abs(ratio - 1.0) < UNEQUAL:
+    if abs(ratio - 1.0) < MAX_SIDE_DIFFERENCE:
         return data
     rows, cols = data.shape
     shape = max(1, int(rows * ratio)), cols

@@ -13,7 +13,7 @@ from flexdt.twin.errors import TwinError
 
 MAX_HEAD_BYTES: Final = 16 << 20
 """Of a text that describes a scan."""
-TOLD: Final = 200
+MAX_REPEATED_CHARACTERS: Final = 200
 """Largest number of characters of a parser's error that a message repeats."""
 
 
@@ -36,7 +36,7 @@ def parsing(path: Path, form: str) -> Iterator[None]:
         said = f"{path} takes more memory than there is"
         raise DatasetFormatError(said, {"path": str(path)}) from None
     except Exception as error:  # A third party's parser on a damaged file: anything may come.
-        words = " ".join(str(error).split())[:TOLD] or type(error).__name__
+        words = " ".join(str(error).split())[:MAX_REPEATED_CHARACTERS] or type(error).__name__
         said = f"{path} is no {form} file, or a damaged one ({words})"
         raise DatasetFormatError(said, {"path": str(path)}) from error
 

@@ -21,7 +21,7 @@ from flexdt.twin.length_units import UNITS_MM
 from flexdt.twin.plausibility import Finding, settled
 from flexdt.twin.plausibility.stated_figures import angle_findings, pixel_findings
 
-KNOWN: Final = (PROJECTION, FLAT, DARK, INVALID)
+KNOWN_KEYS: Final = (PROJECTION, FLAT, DARK, INVALID)
 MOST_DEFLATED: Final = 2000
 """Bytes of images for each byte of the file; of zeros alone there are more."""
 SMALL_BYTES: Final = 1 << 30
@@ -69,7 +69,7 @@ def _read(
     lost = int((keys == INVALID).sum())
     if lost:
         doubts.append(f"{lost} images are marked as invalid and left out")
-    others = sorted(set(keys.tolist()) - set(KNOWN))
+    others = sorted(set(keys.tolist()) - set(KNOWN_KEYS))
     if others:
         many = int(np.isin(keys, others).sum())
         doubts.append(f"{many} images of the keys {', '.join(map(str, others))} are left out")
@@ -196,7 +196,7 @@ def _geometry(
         sod, sdd = distances
         lengths |= {"source distance": sod, "detector distance": sdd - sod}
     pixel = lengths["x_pixel_size"]
-    missing = [what for what, length in lengths.items() if not length and what in NEEDED]
+    missing = [what for what, length in lengths.items() if not length and what in NEEDED_LENGTHS]
     if angles is None:
         missing.insert(0, "rotation_angle")
     if missing or angles is None or pixel is None:
@@ -231,7 +231,7 @@ LENGTHS: Final[Mapping[str, tuple[str, ...]]] = {
 """Length of NXtomo, distances from the sample -> its places in a file, from the entry or
 the group."""
 
-NEEDED: Final = ("x_pixel_size", "source distance", "detector distance")
+NEEDED_LENGTHS: Final = ("x_pixel_size", "source distance", "detector distance")
 """Lengths without which a geometry is undetermined."""
 
 

@@ -31,7 +31,7 @@ KINDS: Final = {3: "u1", 5: "<u2", 10: "<f4"}
 REFERENCES: Final = ("ReferenceData", "MultiReferenceData")
 """Storages with images of the open beam, `Image` or `Image1` and so on."""
 NOT_APPLIED: Final = ("ImageInfo/CameraOffset", "ImageInfo/CameraFineRotation")
-GIVE: Final = ", or give it: geometry=ConeVec"
+GEOMETRY_HINT: Final = ", or give it: geometry=ConeVec"
 
 
 def read_zeiss(path: Path, geometry: ConeVec | None) -> DataSet:
@@ -100,9 +100,11 @@ class _Streams:
 
     def lengths(self, name: str, count: int) -> FloatArray:
         """Read lengths (count,) of `ImageInfo`, without their signs."""
-        found = abs(self.values(f"ImageInfo/{name}", "<f4", count, hint=GIVE).astype(np.float64))
+        found = abs(
+            self.values(f"ImageInfo/{name}", "<f4", count, hint=GEOMETRY_HINT).astype(np.float64)
+        )
         if not np.all((found > 0) & np.isfinite(found)):
-            raise DatasetFormatError(f"{name} is {found.min():g}; allowed: above 0{GIVE}")
+            raise DatasetFormatError(f"{name} is {found.min():g}; allowed: above 0{GEOMETRY_HINT}")
         return found
 
 
@@ -171,12 +173,14 @@ def _geometry(file: _Streams, views: int, rows: int) -> tuple[ConeVec, list[str]
     size = file.lengths("PixelSize", 1) / 1000.0
     rise = np.ptp(file.values("ImageInfo/YPosition", "<f4", views, 0.0)) / 1000.0
     if rise > 0.25 * rows * size:  # Shifts undo the small steps against rings, and no more.
-        raise DatasetFormatError(f"the stage rises by YPosition; allowed: a circle{GIVE}")
+        raise DatasetFormatError(f"the stage rises by YPosition; allowed: a circle{GEOMETRY_HINT}")
     pixel = size * (near[:1] + far[:1]) / near[:1]
     center = file.values("ReconSettings/CenterShift", "<f4", default=0.0)
     shifts = (file.values(f"Alignment/{axis}-Shifts", "<f4", views, 0.0) for axis in "XY")
     right, up = (pixel * (shift + more) for shift, more in zip(shifts, (center, 0), strict=True))
-    angles = np.deg2rad(file.values("ImageInfo/Angles", "<f4", views, hint=GIVE), dtype=np.float64)
+    angles = np.deg2rad(
+        file.values("ImageInfo/Angles", "<f4", views, hint=GEOMETRY_HINT), dtype=np.float64
+    )
     stated = {name: file.values(name, "<f4", default=0.0)[0] for name in NOT_APPLIED}
     doubts = [f"{name} of {value:g} is not applied" for name, value in stated.items() if value]
     if center[0]:

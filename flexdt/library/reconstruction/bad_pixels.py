@@ -16,12 +16,12 @@ from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.reconstruction.acquisition.rectify import on_its_side
 from flexdt.twin.reconstruction.consistency.pixels import BadPixels, bad_pixels
 
-FEWEST: Final = 12
+MIN_VIEWS: Final = 12
 """Smallest number of views in which bad pixels are told from a turning object."""
 MOST_KEPT_BYTES: Final = 128 << 20
 """Largest line integrals kept between the passes over them [bytes]; larger ones are
 recomputed."""
-LEAST_TURN: Final = 0.2
+MIN_TURN: Final = 0.2
 """Spread of the sources over their distance from the axis, at least, of a scan that turns."""
 
 
@@ -53,12 +53,12 @@ def _bad_pixels(
         None with few views, no open beam, hardly any turn, or no bad pixels.
     """
     present = np.array(dataset.present)
-    if len(present) < FEWEST or not (dataset.flat > dataset.dark).any():
+    if len(present) < MIN_VIEWS or not (dataset.flat > dataset.dark).any():
         return None
     some = present[np.unique(np.linspace(0, len(present) - 1, MAX_FROM_DISK).astype(int))]
     views = cone_vec[some]
     spread = np.ptp(views.source[:, :2], axis=0).max()
-    if spread < LEAST_TURN * np.linalg.norm(views.source, axis=1).max():
+    if spread < MIN_TURN * np.linalg.norm(views.source, axis=1).max():
         return None
     lies = on_its_side(views)
     middle = views.project_points(np.zeros((1, 3)), dataset.shape)[:, 0, 1 if lies else 0]

@@ -17,7 +17,7 @@ import numpy as np
 from flexdt.library.datasets.image_set import Arrays, Counts, CountsReader, ImageSet
 from flexdt.twin.geometry.conventions import Float32Array
 
-ALL: Final = slice(None)
+ALL_ROWS: Final = slice(None)
 
 
 class ImagesInMemory:
@@ -30,7 +30,7 @@ class ImagesInMemory:
         """Keep an image (rows, cols), in place of the one that has this number."""
         self._images[number] = image
 
-    def get(self, number: int, rows: slice = ALL) -> Float32Array:
+    def get(self, number: int, rows: slice = ALL_ROWS) -> Float32Array:
         """Return rows of a kept image."""
         return self._images[number][rows]
 
@@ -71,7 +71,7 @@ class ImagesOnDisk:
             raise self._placed(error) from None
         self._shapes[number] = image.shape[0], image.shape[1]
 
-    def get(self, number: int, rows: slice = ALL) -> Float32Array:
+    def get(self, number: int, rows: slice = ALL_ROWS) -> Float32Array:
         """Return rows of a kept image, as `ImagesInMemory.get`.
 
         Raises:
@@ -182,7 +182,7 @@ class KeptImages:
         return image
 
     def prepared(
-        self, number: int, prepare: Callable[[int], Float32Array], rows: slice = ALL
+        self, number: int, prepare: Callable[[int], Float32Array], rows: slice = ALL_ROWS
     ) -> Float32Array:
         """Return rows of a prepared image, preparing and keeping it the first time.
 

@@ -19,11 +19,11 @@ from flexdt.twin.calibration.detect.windows import (
 )
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
-BLOCK: int = 5
+BLOCK_PX: int = 5
 """Side of a block [px]; noise averages out over blocks, edges do not."""
-SHADOW = 0.3
+MAX_SHADOW = 0.3
 """Line integral of a bead above which a block is left out."""
-BENT = 40.0
+MIN_BEND_CHI2 = 40.0
 """Chi-square that the seven bent terms must explain in the median window (white noise: 6.3)."""
 FAR_OUT = 7.0
 """Standard deviations of a window's misfit above the median one from which it is disturbed."""
@@ -57,17 +57,17 @@ def survey(flat: Float32Array, alone: Float32Array) -> Background:
         alone: (m, side, side) the beads alone, rendered there.
     """
     m, side = flat.shape[0], flat.shape[1]
-    count = side // BLOCK
-    edge = (side - count * BLOCK) // 2
+    count = side // BLOCK_PX
+    edge = (side - count * BLOCK_PX) // 2
     seen, beads = (_blocks(a, edge, count) for a in (flat, alone))
     off = seen - beads
-    valid = np.isfinite(off) & (beads < SHADOW)
+    valid = np.isfinite(off) & (beads < MAX_SHADOW)
     off[~valid] = 0.0
-    shapes = _shapes((np.arange(count) + 0.5) * BLOCK + edge - 0.5, side)
+    shapes = _shapes((np.arange(count) + 0.5) * BLOCK_PX + edge - 0.5, side)
     enough = valid.sum(axis=1) >= 24
     straight, plane = _fitted(off, valid, shapes[:, :3], enough)
     curved, coefficients = _fitted(off, valid, shapes, enough)
-    variance = pixel_noise(flat, edge, count * BLOCK) ** 2 / BLOCK**2
+    variance = pixel_noise(flat, edge, count * BLOCK_PX) ** 2 / BLOCK_PX**2
     gain = (straight - curved) / np.maximum(variance, 1e-12)
     bent = bool(enough.any()) and _bends(gain[enough], curved[enough], variance[enough], valid)
     free = valid.sum(axis=1) - (shapes.shape[1] if bent else 3)
@@ -93,15 +93,15 @@ def _bends(
     free = float(np.median(valid.sum(axis=1)))
     left = float(np.median(curved / np.maximum(variance, 1e-12))) - free
     explained = float(np.median(gain))
-    return explained > BENT and left < 0.3 * explained
+    return explained > MIN_BEND_CHI2 and left < 0.3 * explained
 
 
 def _blocks(windows: Float32Array, edge: int, count: int) -> FloatArray:
     """Compute means of blocks, (m, count^2)."""
-    inner = windows[:, edge : edge + count * BLOCK, edge : edge + count * BLOCK]
-    part = inner.reshape(len(windows), count, BLOCK, count * BLOCK).sum(axis=2)
-    summed = part.reshape(len(windows), count, count, BLOCK).sum(axis=3)
-    return np.asarray(summed.reshape(len(windows), -1), dtype=np.float64) / BLOCK**2
+    inner = windows[:, edge : edge + count * BLOCK_PX, edge : edge + count * BLOCK_PX]
+    part = inner.reshape(len(windows), count, BLOCK_PX, count * BLOCK_PX).sum(axis=2)
+    summed = part.reshape(len(windows), count, count, BLOCK_PX).sum(axis=3)
+    return np.asarray(summed.reshape(len(windows), -1), dtype=np.float64) / BLOCK_PX**2
 
 
 def _shapes(places: FloatArray, side: int) -> FloatArray:

@@ -18,7 +18,7 @@ from flexdt.twin.calibration.detect.detection import FAINTEST, Detections, SpotF
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.poses import Poses
 
-ALIKE = 1.2
+MAX_KIND_RATIO = 1.2
 """Factor between the sizes or contrasts of a phantom's beads from which they are of several
 kinds."""
 
@@ -28,7 +28,7 @@ def detector_for(model: BeadModel, poses: Poses) -> SpotFinder:
     sizes, contrasts = model.bead_radius_mm, model.contrasts
     dark = contrasts[contrasts > 0]
     faintest = float(dark.min() / dark.max()) if len(dark) else 1.0
-    several = sizes.max() > ALIKE * sizes.min() or faintest * ALIKE < 1.0
+    several = sizes.max() > MAX_KIND_RATIO * sizes.min() or faintest * MAX_KIND_RATIO < 1.0
     return SpotFinder(
         radius_px=(
             0.65 * float(sizes.min() * poses.pixels_per_mm.min()),

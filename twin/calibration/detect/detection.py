@@ -27,7 +27,7 @@ CAP = 6.0
 """Largest line integral above the background; larger ones are cut. Noise may lower it."""
 FAINTEST = 0.12
 """Least height of a bead, as a share of the strongest small structure's in the image."""
-LIKENESS = 0.90
+MIN_LIKENESS = 0.90
 """Smallest correlation with a ball's profile."""
 MISFIT = 0.3
 """Largest misfit of a fitted ball, as a share of its spot's contrast."""
@@ -268,7 +268,7 @@ def _measure(image: Float32Array, spot: _Candidate, how: SpotFinder) -> FloatArr
     good = (
         result[kernels.OK] > 0
         and low <= result[kernels.RADIUS] <= high
-        and result[kernels.SCORE] >= LIKENESS
+        and result[kernels.SCORE] >= MIN_LIKENESS
         and result[kernels.PEAK] > 5.0 * result[kernels.NOISE] * min(1.0, 3.0 / radius)
     )
     return result if good else None

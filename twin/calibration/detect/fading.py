@@ -15,10 +15,10 @@ import numpy.typing as npt
 
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
-OUTLIER = 4.5
+OUTLIER_RATIO = 4.5
 """Contrasts off by so many times the median deviation (three standard deviations) are
 outliers."""
-MEANS = 10
+MEAN_ROUNDS = 10
 """Rounds in which the means of frames and beads are subtracted in turns; few are missing."""
 
 
@@ -48,7 +48,7 @@ def fading(contrast: FloatArray, behind: FloatArray, seen: npt.NDArray[np.bool_]
             return 0.0
         slope = float((change * more).sum()) / power
         left = np.abs(_against_own_means(logarithm - slope * behind, seen))
-        use = seen & (left <= OUTLIER * float(np.median(left[seen])))
+        use = seen & (left <= OUTLIER_RATIO * float(np.median(left[seen])))
     variance = max(float(np.square(change).sum()) - slope**2 * power, 0.0) / free / power
     slope *= max(1.0 - variance / max(slope**2, 1e-30), 0.0)
     usual = float(np.median(contrast[use]))
@@ -58,7 +58,7 @@ def fading(contrast: FloatArray, behind: FloatArray, seen: npt.NDArray[np.bool_]
 def _against_own_means(values: FloatArray, seen: npt.NDArray[np.bool_]) -> FloatArray:
     """Subtract from values (n, k) the means of their frame and bead; 0 where not seen."""
     out = np.where(seen, values, 0.0)
-    for _ in range(MEANS):
+    for _ in range(MEAN_ROUNDS):
         for axis in (0, 1):
             count = np.maximum(seen.sum(axis=axis, keepdims=True), 1)
             out = np.where(seen, out - out.sum(axis=axis, keepdims=True) / count, 0.0)

@@ -52,7 +52,7 @@ from flexdt.twin.projection.analytic_solids import Scene
 
 MISS_PX = 4.0
 """A measurement further than this from its prediction is not that bead."""
-SHARE = 0.35
+MIN_SHARE = 0.35
 """Least share of a spot in view that is still fitted."""
 FIT_NOISE = 0.008
 """Noise of the line integrals above which complete spots are fitted too: a fit weighs
@@ -67,11 +67,11 @@ LARGEST_PX = 0.6
 """A larger systematic error of a rendered spot is not believed."""
 NEAR_PX = 0.15
 """Largest distance of a spot from its prediction for a judgement of its background [px]."""
-FOREIGN = 10.0
+MAX_MISFIT = 10.0
 """Misfit of a background, relative to the others', from which a spot is left out."""
-LOST = 0.3
+MAX_LOST_SHARE = 0.3
 """Largest share of the spots left out because of their background."""
-EDGE = 0.04
+MIN_EDGE = 0.04
 """Height of a body's edge (line integral) at a bead's rim from which its centroid is preferred."""
 SAMPLING_PX = 0.0005
 """Error that depends on a spot's place in the pixel grid and is left after the correction by
@@ -202,13 +202,13 @@ def _measured(
         patches = _evened(patches, behind, body)
     results = centroids(patches, patches.entire)
     patches = replace(patches, peaks=contrasts(results, patches), radii=patches.radii * sharp.scale)
-    fitted = np.flatnonzero((windows.share > SHARE) & ~windows.whole)
+    fitted = np.flatnonzero((windows.share > MIN_SHARE) & ~windows.whole)
     if ring_noise(results, patches.entire) > FIT_NOISE and sharp.blur >= FIT_BLUR_PX:
         # Start where the centroid is; it stays where the fit fails, and where an edge of the body
         # touches the rim, which a fit relies on.
         good = patches.entire[results[patches.entire, kernels.OK] > 0]
         if body is not None:
-            good = good[~edged(body, windows, EDGE).ravel()[good]]
+            good = good[~edged(body, windows, MIN_EDGE).ravel()[good]]
         fitted = np.concatenate([fitted, good])
     start = patches.offsets.copy()
     begun = fitted[results[fitted, kernels.OK] > 0]
@@ -275,8 +275,8 @@ def _discount(results: FloatArray, behind: Background, expected: FloatArray) -> 
     bad = there & behind.disturbed
     for place in (kernels.VAR_X, kernels.COV_XY, kernels.VAR_Y):
         results[bad, place] *= behind.misfit[bad]
-    worst = bad & (behind.misfit > FOREIGN)
-    if worst.sum() <= LOST * max(int(there.sum()), 1):
+    worst = bad & (behind.misfit > MAX_MISFIT)
+    if worst.sum() <= MAX_LOST_SHARE * max(int(there.sum()), 1):
         results[worst, kernels.OK] = 0.0
 
 

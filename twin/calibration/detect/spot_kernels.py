@@ -16,7 +16,7 @@ X, Y, RADIUS, PEAK, NOISE, SCORE, BIAS, VAR_X, COV_XY, VAR_Y, OK = range(11)
 """Places in the result of `measure` and `fit_ball`."""
 RESULTS = 11
 
-PARTIAL = 0.004
+PARTIAL_ERROR = 0.004
 """Error of a partial spot's place per radius and missing share (measured: 0.007 px where a tenth
 is missing)."""
 FLOOR_PX = 0.0015
@@ -601,7 +601,7 @@ def fit_ball(  # type: ignore[no-untyped-def]
     variance = total / max(count - 4, 1)
     share = used / (math.pi * radius * radius)
     # What is missing of a spot makes its centre depend on its radius and blur.
-    slack = PARTIAL * radius * max(1.0 - share, 0.0)
+    slack = PARTIAL_ERROR * radius * max(1.0 - share, 0.0)
     floor = FIT_FLOOR_PX * FIT_FLOOR_PX + slack * slack
     result[VAR_X] = inverse[0, 0] * variance + floor
     result[COV_XY] = inverse[0, 1] * variance

@@ -25,9 +25,9 @@ LEAST_NOISE = 1e-3
 """Noise of line integrals that is assumed at least: no pixel counts a million photons."""
 LEAST_SEEN = 4
 """Frames in which a pixel must be seen before it can be called dead."""
-STILL = 0.1
+MAX_STILL_SPREAD = 0.1
 """Largest spread of a dead pixel's values over the frames, in units of the noise."""
-STANDS_OUT = 5.0
+DEAD_SIGMAS = 5.0
 """Least difference of a dead pixel from its neighbours in some frame, in units of the noise."""
 WIDEST_DEAD = 4
 """Pixels along the shorter side of a gap that is filled."""
@@ -182,14 +182,14 @@ def mended(images: Float32Array, windows: Windows) -> Float32Array:
         seen[there] += 1
     still = np.zeros(windows.shape, dtype=np.uint8)
     known = seen >= LEAST_SEEN
-    still[known] = high[known] - low[known] < STILL * noise
+    still[known] = high[known] - low[known] < MAX_STILL_SPREAD * noise
     wide = np.ones((WIDEST_DEAD + 1, WIDEST_DEAD + 1), dtype=np.uint8)
     still[cv2.morphologyEx(still, cv2.MORPH_OPEN, wide) > 0] = 0
     dead = np.zeros(windows.shape, dtype=np.bool_)
     suspects = [place for place in places if still[place[3]].any()]
     filled = [_filled(images[f, k][i], still[t] > 0) for f, k, i, t in suspects]
     for (f, k, inside, there), fill in zip(suspects, filled, strict=True):
-        dead[there] |= np.abs(fill - images[f, k][inside]) > STANDS_OUT * noise
+        dead[there] |= np.abs(fill - images[f, k][inside]) > DEAD_SIGMAS * noise
     if not dead.any():
         return images
     out = images.copy()

@@ -5,7 +5,7 @@ width: the phantom is strained, the object turns while it is exposed, beads are 
 the panel distorts, a tile begins, something moves, priors are too narrow. Every
 combination that is tried has its evidence (`fit.evidence`). The most likely is fitted;
 the results of all are averaged, so that the sigmas contain what the data leave open; a
-cause is named where its odds exceed NAMED.
+cause is named where its odds exceed NAMED_LOG_ODDS.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ from flexdt.twin.calibration.fit.residual_structure import MOVING
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.panel import Border, PanelModel
 
-NAMED: Final = math.log(1e4)
+NAMED_LOG_ODDS: Final = math.log(1e4)
 """Logarithm of the odds from which a cause is named."""
-OPEN: Final = math.log(100.0)
+OPEN_LOG_ODDS: Final = math.log(100.0)
 """Logarithm of the odds against a cause up to which it is left open."""
-CHANCE: Final = math.log(0.1)
+LOG_CHANCE: Final = math.log(0.1)
 """Logarithm of the probability that a scan has a cause, before it is seen; assumed."""
-TOLD_CHANCE: Final = math.log(0.5)
+STATED_LOG_CHANCE: Final = math.log(0.5)
 """The same for a cause that the script states: images may be made of instants; assumed."""
 ARC_TOLERANCE: Final = 0.2
 """Relative standard deviation of the squared share of a step that the script states: the
 trigger's place in the exposure is not published; assumed."""
-OUTLIER: Final = 5.0
+OUTLIER_SIGMAS: Final = 5.0
 """Robust standard deviations at which residuals are clipped."""
 STRAIN_WIDTHS: Final = (1e-3, 2.5e-3, 6e-3, 1.5e-2, 4e-2)
 BEAD_SHARES: Final = tuple(2e-4 * 2.0**k for k in range(8))
@@ -58,14 +58,14 @@ MOTION_WIDTHS: Final = (1.0, 4.0, 16.0, 64.0)
 WAVES: Final = 8
 """Number of shapes of a motion here: a ramp, and half waves in a scan."""
 PRIOR_FACTORS: Final = (3.0, 10.0)
-PRIOR_CHANCE: Final = math.log(1e-3)
+PRIOR_LOG_CHANCE: Final = math.log(1e-3)
 """Logarithm of the probability that the scanner is so many times further off than stated;
 assumed."""
-LEAST_MOVING: Final = 12
+MIN_MOVING_FRAMES: Final = 12
 """Least number of frames in which motion is separable from noise."""
 MOST_ROUNDS: Final = 4
 MOST_BORDERS: Final = 2
-WEIGHED: Final = 12.0
+MAX_EVIDENCE_LOSS: Final = 12.0
 """Logarithm of the evidence ratio beyond which models have no weight."""
 NO_PANEL_PX: Final = 1e-4
 """Width of the polynomials at a tile's border without other distortion [px]."""
@@ -73,7 +73,7 @@ SHAPES: Final = ("stretch", "shear")
 """The causes of a phantom of another shape."""
 MOTION_OF: Final = "motion of "
 MOTIONS: Final = frozenset(MOTION_OF + name for name in MOVING)
-EXPLAINED: Final = 0.5
+MAX_REST_SHARE: Final = 0.5
 """Part of the residuals that other causes may leave where something seems to move, too."""
 RIVALS: Final = (MOTION_OF, "priors")
 """Causes that only compete: they are followed elsewhere."""
@@ -94,7 +94,7 @@ class Cause:
     name: str
     columns: tuple[int, ...]
     widths: tuple[float, ...]
-    chance: float = CHANCE
+    chance: float = LOG_CHANCE
     always: float = 0.0
 
 
@@ -120,7 +120,7 @@ class Found:
 
     def named(self, name: str) -> bool:
         """Check whether a cause of the fit is beyond doubt."""
-        return name in self.applied and self.odds.get(name, -math.inf) > NAMED
+        return name in self.applied and self.odds.get(name, -math.inf) > NAMED_LOG_ODDS
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +158,7 @@ class Candidates:
         left = problem.whitened(x)[problem.seen]
         lengths = np.linalg.norm(left, axis=1)
         self.noise = max(float(np.median(lengths)) / RAYLEIGH_MEDIAN, known.floor)
-        bounded = np.minimum(1.0, OUTLIER * self.noise / np.maximum(lengths, 1e-12))
+        bounded = np.minimum(1.0, OUTLIER_SIGMAS * self.noise / np.maximum(lengths, 1e-12))
         share = np.repeat(bounded, 2)[:, None]
         motion = [rows_of for name in self._moving() for rows_of in self._motion(name)]
         table = np.concatenate([rows, *motion], axis=1) * share
@@ -175,7 +175,7 @@ class Candidates:
 
     def _moving(self) -> list[str]:
         sizes = np.bincount(self.fit.problem.group)
-        if len(sizes) != 1 or sizes[0] < LEAST_MOVING:
+        if len(sizes) != 1 or sizes[0] < MIN_MOVING_FRAMES:
             return []
         return [n for n in MOVING if n in self.fit.values]
 
@@ -220,7 +220,7 @@ class Candidates:
             out.append(Cause("panel", columns, PANEL_WIDTHS_PX))
             for i, border in enumerate(panel.borders):
                 at = first + bent + 2 * i
-                chance = CHANCE - math.log(sum(panel.shape))
+                chance = LOG_CHANCE - math.log(sum(panel.shape))
                 out.append(Cause(border_name(border), (at, at + 1), GAP_WIDTHS_PX, chance))
         first = len(layout.names)
         for name in self._moving():
@@ -228,7 +228,7 @@ class Candidates:
             widths = tuple(w * self.noise for w in MOTION_WIDTHS)
             out.append(Cause(MOTION_OF + name, columns, widths))
             first += WAVES
-        out.append(Cause("priors", (), PRIOR_FACTORS, PRIOR_CHANCE))
+        out.append(Cause("priors", (), PRIOR_FACTORS, PRIOR_LOG_CHANCE))
         return tuple(out)
 
     def judged(self, choice: Choice) -> Judged | None:
@@ -317,7 +317,9 @@ class Candidates:
         some = [
             m
             for c, m in self._judged.items()
-            if m is not None and c[-1] == choice[-1] and m.evidence > at.evidence - WEIGHED
+            if m is not None
+            and c[-1] == choice[-1]
+            and m.evidence > at.evidence - MAX_EVIDENCE_LOSS
         ]
         weights = np.exp(np.array([m.evidence for m in some]) - at.evidence)
         _, spread = averaged(some, weights / weights.sum(), self.count, at)
@@ -379,7 +381,7 @@ def _arc(column: int, share: float | None) -> list[Cause]:
         return [Cause("arc", (column,), (ARC_PRIOR,))]
     if share == 0.0:
         return []
-    return [Cause("arc", (column,), (ARC_TOLERANCE * share**2,), TOLD_CHANCE)]
+    return [Cause("arc", (column,), (ARC_TOLERANCE * share**2,), STATED_LOG_CHANCE)]
 
 
 def explained_by_causes(fit: FitResult, known: Known, refit: Refit) -> tuple[FitResult, Found]:
@@ -417,13 +419,17 @@ def explained_by_causes(fit: FitResult, known: Known, refit: Refit) -> tuple[Fit
     odds = candidates.odds()
     moves = any(p for c, p in zip(candidates.causes, choice, strict=True) if c.name in MOTIONS)
     # What moves looks like other causes in part, and most of it stays in the residuals.
-    if moves and fit.certificate.rms_px > EXPLAINED * first.certificate.rms_px:
+    if moves and fit.certificate.rms_px > MAX_REST_SHARE * first.certificate.rms_px:
         return first, Found(odds)
     names = tuple(
         c.name for c, pick in zip(candidates.causes, choice, strict=True)
         if pick and not c.name.startswith(RIVALS)
     )  # fmt: skip
-    doubtful = tuple(n for n, o in odds.items() if -OPEN < o < NAMED and not n.startswith(RIVALS))
+    doubtful = tuple(
+        n
+        for n, o in odds.items()
+        if -OPEN_LOG_ODDS < o < NAMED_LOG_ODDS and not n.startswith(RIVALS)
+    )
     found = Found(odds, names, doubtful, candidates.strain(choice))
     return _widened(fit, candidates, choice), found
 

@@ -48,18 +48,18 @@ LEAST_TURN_DEG = 0.2
 """Turn between two parts of a scan from which it is reported [deg]."""
 FEW_TURNED = math.radians(75.0)
 """Stated turn of the frames of which the true one is looked for."""
-TURNS = (0.5, 0.56, 0.62, 0.7, 0.8, 0.9, 1.1, 1.25, 1.4, 1.6, 1.8, 2.0)
+TURN_FACTORS = (0.5, 0.56, 0.62, 0.7, 0.8, 0.9, 1.1, 1.25, 1.4, 1.6, 1.8, 2.0)
 """Trial factors of the angles; values between them are fitted."""
 LEAST_TURN = 0.04
 """Least relative error of a turn for that; smaller ones are found in other ways."""
 TURN_WIDTH = {"angle_scale": 0.1}
 """Standard deviation of the factor about a trial value."""
-SAMPLED = 8
+SAMPLED_FRAMES = 8
 """Number of frames that are examined one by one."""
 
 SHOWN_AT_LEAST = 0.5
 """Least share of the frames with spots for another reading of the images to be reported."""
-SHOWN = 5
+MAX_SHOWN = 5
 """Largest number of unusable files that are named."""
 _STATES = {
     FrameState.MISSING: ("frames_missing", "missing"),
@@ -83,8 +83,8 @@ def judge_frames(scan: Scan, looks: Sequence[FrameSpots], sought: SpotFinder) ->
         files = sorted({look.unusable for look in some if look.unusable})
         text = f"{name}: {len(some)} of {n} frames are {what}; the others are used"
         if files:
-            more = f" (and {len(files) - SHOWN} more)" if len(files) > SHOWN else ""
-            text += f"; unusable: {'; '.join(files[:SHOWN])}{more}"
+            more = f" (and {len(files) - MAX_SHOWN} more)" if len(files) > MAX_SHOWN else ""
+            text += f"; unusable: {'; '.join(files[:MAX_SHOWN])}{more}"
         if some:
             out.append((error if len(some) == n else warning)(code, text))
     usable = [look for look in looks if look.state is FrameState.USABLE]
@@ -448,7 +448,7 @@ def _other_turn(detections: Sequence[Detections], model: BeadModel, poses: Poses
     if n < 4:
         return None
     best = (GOOD_RMS_PX, 1.0)
-    for factor in TURNS:
+    for factor in TURN_FACTORS:
         some = replace(poses, angle=poses.angle[0] + factor * turned)[:n]
         own = attempt(detections[:n], model, some, loose=TURN_WIDTH)
         if own is not None and _convincing(own) and own.rms_px < best[0]:
@@ -471,7 +471,7 @@ def _one_by_one(detections: Sequence[Detections], model: BeadModel, poses: Poses
         model: the beads.
         poses: nominal geometry.
     """
-    chosen = np.linspace(0, len(poses) - 1, SAMPLED).astype(int).tolist()
+    chosen = np.linspace(0, len(poses) - 1, SAMPLED_FRAMES).astype(int).tolist()
     good = 0
     for i in chosen:
         alone = slice(i, i + 1)

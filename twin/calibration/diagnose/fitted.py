@@ -39,16 +39,16 @@ BLOCK_SHARE = 0.7
 """Part of the frames of a block, from the first or to the last of a scan, that do not fit."""
 MOST_USED = 0.9
 """Share of the positions below which a fit is good only because it left the others out."""
-NOISY = 1.5
+NOISE_SIGMAS = 1.5
 """Stated sigmas below which residuals are noise, however large."""
-SIZE = 0.04
+MAX_SIZE_ERROR = 0.04
 """Deviation of the spots' radii from the expected ones that indicates a wrong scale."""
-BLURRED = 0.6
+BLUR_TOLERANCE = 0.6
 """Further deviation allowed, in units of the squared blur over radius (measured)."""
-BODY = 0.5
+MAX_BODY_LOG = 0.5
 """Logarithm of the body's seen over its described attenuation from which it is reported:
 beam hardening alone stays below."""
-BODY_MM = 0.3
+MAX_BODY_MM = 0.3
 """Shift of the body from its description from which it is reported [mm]."""
 PLAUSIBLE_SHARE = 0.12
 """Largest offset along the beam, as a share of SOD, that a mount may cause. A phantom that is
@@ -172,14 +172,15 @@ def judge_size(measured: Refined, radius_px: float) -> Finding | None:
     """
     off = abs(measured.size - 1.0)
     blur = measured.blur_px / radius_px
-    if not off >= SIZE:
+    if not off >= MAX_SIZE_ERROR:
         return None
-    if off < SIZE + BLURRED * blur**2:
+    if off < MAX_SIZE_ERROR + BLUR_TOLERANCE * blur**2:
         return warning(
             "blurred",
             f"the images are blurred by {measured.blur_px:.1f} px and the shadows are "
             f"{radius_px:.1f} px wide: the beads' size is known to "
-            f"{100 * (SIZE + BLURRED * blur**2):.0f} % only, and with it the phantom's scale",
+            f"{100 * (MAX_SIZE_ERROR + BLUR_TOLERANCE * blur**2):.0f} % only, "
+            "and with it the phantom's scale",
         )
     return _other_size(measured.size)
 
@@ -206,7 +207,7 @@ def judge_body(measured: Sequence[Refined]) -> Finding | None:
         )
     for body in bodies:
         x, y, z = body.shift_mm
-        if abs(math.log(body.factor)) > BODY or math.hypot(x, y, z) > BODY_MM:
+        if abs(math.log(body.factor)) > MAX_BODY_LOG or math.hypot(x, y, z) > MAX_BODY_MM:
             return warning(
                 "body_differs",
                 f"the phantom's body attenuates {body.factor:.2f} times what is described and "
@@ -255,7 +256,7 @@ def explain_residuals(
         fit, told = plain, []
     certificate = fit.certificate
     out = [*_lost_beads(fit), *_drifts(fit), *told]
-    noisy = sigmas_known and certificate.noise < NOISY
+    noisy = sigmas_known and certificate.noise < NOISE_SIGMAS
     bad = certificate.rms_px >= misfit_px and not noisy
     if bad or plain.certificate.used.sum() < MOST_USED * plain.problem.seen.sum():
         turned = _angle_scale(plain, refit)

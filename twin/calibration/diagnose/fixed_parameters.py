@@ -25,18 +25,18 @@ HELD_SIGMAS: Final = 5.0
 """How far, in standard deviations, the data may have a fixed parameter from where it is fixed."""
 DOUBT_SIGMAS: Final = 2.3
 """Sigmas beyond which the intervals of free parameters contain the change by fixed ones."""
-LOOSE: Final = 10.0
+LOOSE_FACTOR: Final = 10.0
 """Factor on the priors in the fit with which they are compared."""
-ALIKE: Final = 9.0
+MAX_RIVAL_CHI2: Final = 9.0
 """Difference of chi2 below which two causes are both possible: three standard deviations."""
-MOST_TOLD: Final = 0.5
+MIN_VARIANCE_DROP: Final = 0.5
 """Least share by which images must lower the variance of such a loose prior to count. (At
 0.9 an SDD 13 mm off its prior of 1 mm, determined to 5 mm by images, was offered 12
 sigmas off.)"""
-EXACT: Final = 3.0
+MIN_GROWTH: Final = 3.0
 """Growth of a sigma from which values stated as exact are named, if they cannot be
 checked, or if images narrow their usual prior by less."""
-NARROW: Final = 0.01
+NARROW_CHANCE: Final = 0.01
 """Probability of such a contradiction with right priors below which priors are widened."""
 
 
@@ -106,7 +106,7 @@ class PriorsJudged:
     causes: tuple[str, ...] = ()
 
 
-def loosened(priors: Mapping[str, float], factor: float = LOOSE) -> dict[str, float]:
+def loosened(priors: Mapping[str, float], factor: float = LOOSE_FACTOR) -> dict[str, float]:
     """Widen priors by a factor."""
     return {name: width * factor for name, width in priors.items()}
 
@@ -134,11 +134,11 @@ def judge_exact(fit: FitResult, freed: FitResult, exact: Mapping[str, float]) ->
     growth = {
         n: after[n].sigma / e.sigma
         for n, e in fit.certificate.estimates.items()
-        if n in after and e.sigma > 0 and after[n].sigma > EXACT * e.sigma
+        if n in after and e.sigma > 0 and after[n].sigma > MIN_GROWTH * e.sigma
     }
     own = {n: after[n].prior or math.inf for n in exact if n in after}
     causes = dict.fromkeys(c for n in growth for c in after[n].priors if c in exact)
-    causes |= dict.fromkeys(n for n, prior in own.items() if EXACT * after[n].sigma > prior)
+    causes |= dict.fromkeys(n for n, prior in own.items() if MIN_GROWTH * after[n].sigma > prior)
     if not causes:
         return None
     worst = sorted(growth, key=lambda n: -growth[n])[:3] or list(causes)
@@ -179,16 +179,16 @@ def judge_priors(loose: FitResult, exact: Container[str] = ()) -> PriorsJudged:
     moved = (np.array([e.value for e in found]) - means) / width
     values, vectors = np.linalg.eigh(c.covariance[np.ix_(at, at)] / np.outer(width, width))
     values = np.maximum(values, 1e-8)  # exact positions know some directions to rounding
-    some = values < 1.0 - MOST_TOLD
+    some = values < 1.0 - MIN_VARIANCE_DROP
     if not some.any():
         return PriorsJudged(None, 1.0)
     kept = 1.0 - values[some]
-    spread = kept * (kept / LOOSE**2 + values[some])
+    spread = kept * (kept / LOOSE_FACTOR**2 + values[some])
     square = float(np.sum((vectors.T @ moved)[some] ** 2 / spread))
     count = int(some.sum())
     chance = _chance(square, count, c.dof)
     sigmas = np.array([e.sigma for e in found])
-    ratios = np.abs(moved) / np.sqrt(1.0 / LOOSE**2 + sigmas**2 / width**2)
+    ratios = np.abs(moved) / np.sqrt(1.0 / LOOSE_FACTOR**2 + sigmas**2 / width**2)
     scores = np.array([_deviate_of(ratio, c.dof) for ratio in ratios.tolist()])
     # The images alone, as a quadratic of curvature A and gradient y, and what they and all priors
     # but one would say of that one.
@@ -196,11 +196,11 @@ def judge_priors(loose: FitResult, exact: Container[str] = ()) -> PriorsJudged:
     curvature = (vectors * weight) @ vectors.T
     gradient = np.where(some, 1.0 / values, 0.0)
     y = vectors @ (gradient * (vectors.T @ moved))
-    everything = np.linalg.inv(curvature + LOOSE**2 * np.eye(len(width)))
+    everything = np.linalg.inv(curvature + LOOSE_FACTOR**2 * np.eye(len(width)))
     gains, alone = [], []
     for j in range(len(width)):
-        priors = np.full(len(width), LOOSE**2)
-        priors[j] = 1e-6 * LOOSE**2
+        priors = np.full(len(width), LOOSE_FACTOR**2)
+        priors[j] = 1e-6 * LOOSE_FACTOR**2
         without = np.linalg.inv(curvature + np.diag(priors))
         gains.append(float(y @ (without - everything) @ y))
         alone.append(
@@ -209,15 +209,15 @@ def judge_priors(loose: FitResult, exact: Container[str] = ()) -> PriorsJudged:
     order = np.argsort(gains)[::-1].tolist()
     best = gains[order[0]]
     enough = best > DOUBT_SIGMAS**2
-    likely = [i for i in order if gains[i] > max(best - ALIKE, best / 2)] if enough else []
+    likely = [i for i in order if gains[i] > max(best - MAX_RIVAL_CHI2, best / 2)] if enough else []
     if max(float(scores.max()), _deviate(chance)) <= HELD_SIGMAS:
-        factor = math.sqrt(square / count) if chance < NARROW else 1.0
+        factor = math.sqrt(square / count) if chance < NARROW_CHANCE else 1.0
         return PriorsJudged(None, factor, tuple(names[i] for i in likely))
     likely = likely or order[:1]
     causes = tuple(names[i] for i in likely)
     texts = [
         f"{names[i]} is known as {means[i]:g} "
-        + ("exactly" if names[i] in exact else f"+- {width[i] / LOOSE:g} {found[i].unit}")
+        + ("exactly" if names[i] in exact else f"+- {width[i] / LOOSE_FACTOR:g} {found[i].unit}")
         + f", the images say {means[i] + alone[i][0]:.4g} +- {alone[i][1]:.1g} {found[i].unit}"
         for i in likely
     ]

@@ -24,14 +24,14 @@ from flexdt.twin.geometry.poses import Poses
 
 MOST_SHIFT: Final = 6
 """Numbers by which a frame may be off."""
-CHANGE: Final = math.log(1e3)
+CHANGE_COST: Final = math.log(1e3)
 """Cost of another shift than the frame's before; assumed: one frame in a thousand."""
-ASTRAY: Final = math.log(1e3)
+ASTRAY_COST: Final = math.log(1e3)
 """Cost of a spot that belongs to no bead."""
 GOOD_SHARE: Final = 0.8
 """Part of the frames that must show the phantom at the angles found."""
 LEAST_SPREAD_PX: Final = 0.05
-SHOWN: Final = 6
+MAX_SHOWN: Final = 6
 """Largest number of changes that are listed."""
 
 
@@ -81,7 +81,8 @@ class FrameNumbers:
             if not again:
                 return None
             said = "; ".join(
-                f"frame {i} shows what frame {i + int(self.shift[i])} should" for i in again[:SHOWN]
+                f"frame {i} shows what frame {i + int(self.shift[i])} should"
+                for i in again[:MAX_SHOWN]
             )
             return warning(
                 "frames_inconsistent",
@@ -91,9 +92,9 @@ class FrameNumbers:
         settled = self._settled
         changes = np.flatnonzero(np.diff(settled)) + 1
         said = "; ".join(
-            _change(int(i), int(settled[i] - settled[i - 1])) for i in changes[:SHOWN].tolist()
+            _change(int(i), int(settled[i] - settled[i - 1])) for i in changes[:MAX_SHOWN].tolist()
         )
-        more = "" if len(changes) <= SHOWN else f" (and {len(changes) - SHOWN} more)"
+        more = "" if len(changes) <= MAX_SHOWN else f" (and {len(changes) - MAX_SHOWN} more)"
         return error(
             "frame_numbers",
             f"{name}: {said}{more}: the frames' angles are those of other frames; number them "
@@ -142,8 +143,8 @@ def frame_numbers(
         for i in np.flatnonzero(there).tolist():
             gap = np.linalg.norm(detections[i].centers[:, None] - places[i][None], axis=2)
             square = (gap.min(axis=1) / spread) ** 2
-            costs[i, column] = float(np.minimum(0.5 * square, ASTRAY).sum())
-            near[i, column] = float(np.mean(0.5 * square < ASTRAY))
+            costs[i, column] = float(np.minimum(0.5 * square, ASTRAY_COST).sum())
+            near[i, column] = float(np.mean(0.5 * square < ASTRAY_COST))
     path = _likeliest(costs)
     fits = near[np.arange(n), path] > 0.5
     if fits[there].mean() < GOOD_SHARE:
@@ -171,9 +172,9 @@ def _likeliest(costs: FloatArray) -> npt.NDArray[np.intp]:
     own = np.arange(states)
     for i in range(1, n):
         best = int(np.argmin(total))
-        moved = total[best] + CHANGE < total
+        moved = total[best] + CHANGE_COST < total
         came[i] = np.where(moved, best, own)
-        total = np.where(moved, total[best] + CHANGE, total) + costs[i]
+        total = np.where(moved, total[best] + CHANGE_COST, total) + costs[i]
     path = np.empty(n, dtype=np.intp)
     path[-1] = int(np.argmin(total))
     for i in range(n - 1, 0, -1):

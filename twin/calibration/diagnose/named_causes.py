@@ -13,7 +13,7 @@ from flexdt.twin.calibration.fit.problem import STRAINS
 from flexdt.twin.calibration.fit.residual_structure import SIGNIFICANT
 from flexdt.twin.geometry.conventions import FloatArray
 
-SPOKEN: Final = {
+CAUSE_WORDS: Final = {
     "stretch": "a phantom of another shape",
     "shear": "a phantom of another shape",
     "beads": "beads elsewhere",
@@ -21,7 +21,7 @@ SPOKEN: Final = {
     "panel": "a panel that distorts",
 }
 """Cause that may be left open -> its words."""
-ALIKE: Final = ("arc", "beads", "panel")
+SHAPE_LIKE_CAUSES: Final = ("arc", "beads", "panel")
 """Causes that may look like a phantom of another shape."""
 TERMS: Final[dict[str, dict[str, float]]] = {
     "taller": {"zz": 1.0, "xx": -0.5, "yy": -0.5},
@@ -59,9 +59,9 @@ def named_causes(fit: FitResult, plain: FitResult, found: Found) -> list[Finding
         out.append(_distorted(fit))
     doubtful = [n for n in found.applied if not found.named(n)]
     if strained is not None:  # It is said which rivals it has.
-        doubtful = [n for n in doubtful if n not in SHAPES and n not in ALIKE]
+        doubtful = [n for n in doubtful if n not in SHAPES and n not in SHAPE_LIKE_CAUSES]
     if doubtful:
-        rivals = dict.fromkeys(SPOKEN.get(n, f"a {n}") for n in [*doubtful, *found.open])
+        rivals = dict.fromkeys(CAUSE_WORDS.get(n, f"a {n}") for n in [*doubtful, *found.open])
         said = " or ".join(rivals)
         out.append(
             warning(
@@ -92,7 +92,7 @@ def _strained(found: Found) -> Finding | None:
         return None
     most = max(map(abs, certain.values()))
     said = ", ".join(f"{100 * v:+.2g} % {n}" for n, v in certain.items() if abs(v) > 0.3 * most)
-    alike = [SPOKEN[n] for n in ALIKE if n in found.open or n in found.applied]
+    alike = [CAUSE_WORDS[n] for n in SHAPE_LIKE_CAUSES if n in found.open or n in found.applied]
     rival = f" (or there is {' or '.join(alike)}, which looks alike)" if alike else ""
     return warning(
         "phantom_strained",

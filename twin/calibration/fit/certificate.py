@@ -42,7 +42,7 @@ from flexdt.twin.geometry.conventions import FloatArray
 
 RANK_TOLERANCE = 1e-8
 """Singular values of the column-scaled Jacobian below this share of the largest are zero."""
-ROUNDING = 1e-9
+MAX_ROUNDING = 1e-9
 """Residuals of exact positions [whitened] below which structure is rounding."""
 LEAST_FREEDOM = 1e-3
 """Degrees of freedom from which the residuals have a spread."""
@@ -55,7 +55,7 @@ SOURCES = {
     "panel": "the panel's distortion",
 }
 """First word of a column's name that is no parameter -> its source, in words."""
-MEASURE = {
+MEASUREMENT_ADVICE = {
     SOURCES["bead"]: "beads measured more exactly would tell more",
     SOURCES["strain"]: "a measured distance of two beads, and --bead-tolerance, would tell more",
 }
@@ -271,7 +271,7 @@ class Certificate:
         for name, e in self.estimates.items():
             if e.asked and e.sigma**2 > 2 * e.images**2 and e.priors:
                 sources = list(e.priors)
-                better = MEASURE.get(
+                better = MEASUREMENT_ADVICE.get(
                     sources[0], "a second placement at another SOD in the same fit would tell more"
                 )
                 out[name] = (
@@ -415,7 +415,7 @@ def certify(
     )
     structure = (False, False)
     moving: tuple[Drift, ...] = ()
-    if spec.full and noise > ROUNDING:
+    if spec.full and noise > MAX_ROUNDING:
         left = Residuals(
             problem, jac[keep] / factor, problem.whitened(x).ravel()[keep], keep,
             spec.unit_covariance, noise,

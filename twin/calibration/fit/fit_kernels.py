@@ -40,7 +40,7 @@ DO_X, DO_Y, DO_Z, ALPHA, TAU_X, TAU_Z, DD_X, DD_Y, DD_Z, DS_X, DS_Y = range(11)
 ROLL, PITCH, YAW, TILT_X, TILT_Z, ANGLE_SCALE = range(11, PARAMETERS)
 # First columns of a row of `geometry`.
 SOURCE, AXIS, DETECTOR, U, V, ANGLE, MOUNT = 0, 3, 6, 9, 12, 15, 16
-STEP = 1e-30
+IMAGINARY_STEP = 1e-30
 """Imaginary part of a parameter for its derivative: its square is negligible."""
 
 
@@ -203,10 +203,10 @@ def evaluate(  # type: ignore[no-untyped-def]
         own = 0
         for i in active:
             if want > 0 and colmap[group[f], i] >= 0:
-                values[i] += STEP * 1j
+                values[i] += IMAGINARY_STEP * 1j
                 frame_matrix(values, geo, pivot, matrix, foot)
                 values[i] = values[i].real
-                slope[own], slide[own] = matrix.imag / STEP, foot.imag / STEP
+                slope[own], slide[own] = matrix.imag / IMAGINARY_STEP, foot.imag / IMAGINARY_STEP
                 cols[own] = colmap[group[f], i]
                 own += 1
         if bead_col >= 0:

@@ -40,14 +40,14 @@ WAVES: Final = (1.0, 4.0, 16.0, 64.0, math.inf)
 """Trial smoothness: half waves in a scan above which amplitudes fall; inf: no fall."""
 COLUMNS: Final = 512
 """Number of covariance columns processed at a time."""
-DOUBT: Final = 2.0
+MAX_LIKELIHOOD_LOSS: Final = 2.0
 """Loss of log likelihood up to which width and smoothness are not rejected."""
-ONCE: Final = 2
+ONE_PERIOD: Final = 2
 """Half waves of the cosine with one period a scan."""
 MOST_PASSES: Final = 6
 BESIDE_BEAM: Final = 0.01
 """Standard deviation of the slope of a motion along the beam against it: 6 mm in 600; assumed."""
-EVIDENCE: Final = 6.0
+MIN_EVIDENCE: Final = 6.0
 """Gain in log likelihood from which a parameter counts as moving: white noise has it in less than
 one of a thousand fits (55 pairs of width and smoothness are tried)."""
 _Answer = tuple[FloatArray, FloatArray, FloatArray, float]
@@ -506,7 +506,7 @@ def _most_likely(model: _Mixed) -> tuple[_Choice, list[float]]:
         for i in moving:
             evidence[i] = likelihood(i, choice[i]) - likelihood(i, None)
         least = min(moving, key=lambda i: evidence[i], default=-1)
-        if least < 0 or evidence[least] >= EVIDENCE:
+        if least < 0 or evidence[least] >= MIN_EVIDENCE:
             break
         choice[least] = None
     for i, best in enumerate(choice):
@@ -516,7 +516,7 @@ def _most_likely(model: _Mixed) -> tuple[_Choice, list[float]]:
         fair = [
             pick
             for pick in product(WIDTHS, WAVES)
-            if pick[0] >= best[0] and likelihood(i, pick) >= top - DOUBT
+            if pick[0] >= best[0] and likelihood(i, pick) >= top - MAX_LIKELIHOOD_LOSS
         ]
-        choice[i] = max((model.spectrum(i, pick)[0][ONCE], pick) for pick in fair)[1]
+        choice[i] = max((model.spectrum(i, pick)[0][ONE_PERIOD], pick) for pick in fair)[1]
     return tuple(choice), evidence

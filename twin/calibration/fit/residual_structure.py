@@ -20,16 +20,16 @@ from flexdt.twin.geometry.conventions import FloatArray
 
 SIGNIFICANT = 4.5
 """Standard deviations from which a test statistic is significant."""
-SUSPECT = 2.3
+SUSPECT_SIGMAS = 2.3
 """The same for a steady drift to be allowed for without being reported: a drift that just
 escapes notice moves a parameter by 1.7 times its score."""
 SUSPECT_STEP = 3.5
 """The same for jumps, of which many are tried."""
-TOGETHER = 3.2
+CLUSTER_SIGMAS = 3.2
 """The same for errors that the beads of a frame share."""
 HARMONICS = 3
 """Number of harmonics of the turn in which errors of single beads are sought."""
-HINT = 1.5
+HINT_SIGMAS = 1.5
 """The same for a second drift once a first is found."""
 MOVING = ("dO_x", "dO_y", "dO_z", "alpha")
 """Parameters that may change during a scan: the object's place and angle (a drift of the source or
@@ -130,8 +130,8 @@ def drifts(left: Residuals) -> tuple[Drift, ...]:
             part = slice(i * len(shapes), (i + 1) * len(shapes))
             each = np.abs(score[part])
             best = int(np.argmax(each))
-            suspect = best if each[best] > SUSPECT_STEP else 0 if each[0] > SUSPECT else None
-            hint = best if each[best] > HINT else None
+            suspect = best if each[best] > SUSPECT_STEP else 0 if each[0] > SUSPECT_SIGMAS else None
+            hint = best if each[best] > HINT_SIGMAS else None
             for at, among in ((suspect, suspects), (hint, found)):
                 if at is not None:
                     size = float(push[part][at] / power[part][at])
@@ -168,7 +168,7 @@ def cluster_covariance(left: Residuals) -> FloatArray | None:
         total = float(spread.sum())
         if total > 0:
             alike = max(alike, float(together.sum()) / (noise**2 * math.sqrt(2.0 * total)))
-    if alike < TOGETHER:
+    if alike < CLUSTER_SIGMAS:
         return None
     scores = np.zeros((n, p))
     np.add.at(scores, member, jacobian * residual[:, None])

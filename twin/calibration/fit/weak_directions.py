@@ -23,7 +23,7 @@ BOUND = 5.0
 """Standard deviation [mm, deg] beyond which a parameter is not determined, 25 tolerances. For
 angle_scale it is 5 deg in a turn."""
 
-SHOWN = 3
+MAX_SHOWN = 3
 """Largest number of columns named after the first."""
 _OBJECT = {"dO_x", "dO_y", "dO_z"}
 _DETECTOR = {"dD_x", "dD_y", "dD_z"}
@@ -55,9 +55,9 @@ class Direction:
     def text(self) -> str:
         """One line for a report."""
         first, *rest = self.parts
-        against = ", ".join(f"{n} ({c:+.3g} {unit_of(n)})" for n, c in rest[:SHOWN])
-        if len(rest) > SHOWN:
-            against += f" and {len(rest) - SHOWN} more"
+        against = ", ".join(f"{n} ({c:+.3g} {unit_of(n)})" for n, c in rest[:MAX_SHOWN])
+        if len(rest) > MAX_SHOWN:
+            against += f" and {len(rest) - MAX_SHOWN} more"
         head = f"{first[0]} against {against}" if rest else first[0]
         size = (
             "not determined at all"

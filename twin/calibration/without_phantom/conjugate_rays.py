@@ -38,31 +38,31 @@ SECTORS: Final = 24
 """Number of sectors of the turn that are left out in turn."""
 SMOOTHING: Final = 128.0
 """Columns over the smoothing's sigma, which is one column at least."""
-VIEWS_OVER: Final = 4.0
+MAX_VIEWS_RATIO: Final = 4.0
 """Columns times the step between views [rad] over the smoothing's sigma, at most."""
-EDGE: Final = 8
+EDGE_VIEWS: Final = 8
 """Views repeated at both ends for the splines over the angle."""
 ROUNDS, NEAR = 4, 0.05
 """Steps towards the axis column at most, and part of a sigma that is none."""
 PER_SIGMA: Final = 3.0
 """Distances from the axis that are read in a sigma of the smoothing, at least a column apart."""
-BINS: Final = 24
+MAX_BINS: Final = 24
 """Largest number of bins of distances from the axis."""
-WIDE: Final = 2.0
+MIN_BIN_SIGMAS: Final = 2.0
 """Least width of a bin, in sigmas of the smoothing."""
 YAW_PX: Final = 0.1
 """By so much a yaw may move the ends of the panel against its middle, beyond that in force [px]."""
 LEAST_BINS: Final = 8
 """One bin of so many may be left out: where a wall turns back, more is wrong than elsewhere."""
-FEWEST_BINS: Final = 4
+MIN_BINS: Final = 4
 """Least number of informative bins."""
 MOST_MOVED: Final = 0.1
 """Part of the innermost bin that a step may move, at most: without a bin inside, it is a shift."""
 BEYOND, BESIDE = 3, 2
 """Whole bins beyond a step, at least, and beside it that are not left out."""
-WIDEST: Final = 5.0
+MAX_WIDTH_PX: Final = 5.0
 """Largest width of a gap [px]."""
-ALIKE: Final = 0.3
+MIN_CORRELATION: Final = 0.3
 """Least correlation of the slopes of both ends of rays: noise alone has none."""
 CHANCE: Final = 1e-4
 """Probability of a step in a scan without one."""
@@ -145,7 +145,7 @@ class Profile:
             left_out = np.flatnonzero(np.isinf(sigma))
             clear = (np.abs(border[:, None] - left_out) > BESIDE).all(axis=1)
             narrow = clear & self._has_inside
-            narrow &= np.array([abs(one.width) < WIDEST for one in steps])
+            narrow &= np.array([abs(one.width) < MAX_WIDTH_PX for one in steps])
             if not narrow.any():
                 break
             ratio = np.where(narrow, [abs(one.width) / one.least for one in steps], 0.0)
@@ -266,10 +266,10 @@ class ConjugateRays:
     def __init__(self, scan: CircularScan, band: FloatArray, rows: FloatArray, step: float) -> None:
         self.scan, self.band, self.rows, self.step = scan, band, rows, step
         self.views, self.cols = len(band), band.shape[2]
-        self.smoothing = max(1.0, self.cols / SMOOTHING, step * self.cols / VIEWS_OVER)
+        self.smoothing = max(1.0, self.cols / SMOOTHING, step * self.cols / MAX_VIEWS_RATIO)
         soft = gaussian_filter1d(band, self.smoothing, axis=2, mode="nearest")
         self.splines = [
-            spline_filter(np.pad(one, ((EDGE, EDGE), (0, 0)), mode="wrap"))
+            spline_filter(np.pad(one, ((EDGE_VIEWS, EDGE_VIEWS), (0, 0)), mode="wrap"))
             for one in soft.transpose(1, 0, 2)
         ]
         self.sector = np.arange(self.views) * SECTORS // self.views
@@ -308,7 +308,7 @@ class ConjugateRays:
         slope = self.scan.slopes(values, self.scan.scales[: len(values)])[0]
         for _ in range(ROUNDS):
             _, moved, told, power = self._sums(values)
-            if not told.sum() > ALIKE * power.sum():
+            if not told.sum() > MIN_CORRELATION * power.sum():
                 return values, math.inf
             shift, sigma = _left_out(moved.sum(axis=(1, 2)), told.sum(axis=(1, 2)))
             values[0] -= shift / 2.0 / slope
@@ -329,17 +329,19 @@ class ConjugateRays:
         if len(radius) == 0:
             return None
         weight = told.sum(axis=(0, 1))
-        place = (radius / max(WIDE * self.smoothing, radius[-1] / BINS)).astype(np.intp)
+        place = (radius / max(MIN_BIN_SIGMAS * self.smoothing, radius[-1] / MAX_BINS)).astype(
+            np.intp
+        )
         count = int(place[-1]) + 1
         of_bin = (place[:, None] == np.arange(count)).astype(np.float64)
         moved, told = moved @ of_bin, told @ of_bin
-        good = np.bincount(place, weight) > ALIKE * np.bincount(place, power)
+        good = np.bincount(place, weight) > MIN_CORRELATION * np.bincount(place, power)
         shift, sigma = np.ones((2, count))
         for i in np.flatnonzero(good).tolist():
             ways = [_left_out(*(t[..., i].sum(axis=a) for t in (moved, told))) for a in (1, 0)]
             shift[i], sigma[i] = ways[0][0], max(way[1] for way in ways)
         good &= np.isfinite(sigma)
-        if good.sum() < FEWEST_BINS:
+        if good.sum() < MIN_BINS:
             return None
         kept, renumbered = good[place], np.cumsum(good) - 1
         radius, weight, place = radius[kept], weight[kept].clip(1e-30), renumbered[place[kept]]
@@ -404,7 +406,7 @@ class ConjugateRays:
 
     def _read(self, group: int, view: FloatArray, columns: FloatArray) -> FloatArray:
         """Read one group of rows between views (n, k) at columns of the panel (k,)."""
-        at = np.stack([view % self.views + EDGE, np.broadcast_to(columns, view.shape)])
+        at = np.stack([view % self.views + EDGE_VIEWS, np.broadcast_to(columns, view.shape)])
         return np.asarray(
             map_coordinates(self.splines[group], at, order=3, prefilter=False, mode="nearest")
         )

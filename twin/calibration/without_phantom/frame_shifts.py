@@ -20,13 +20,13 @@ from flexdt.twin.calibration.without_phantom.plane_pairs import PlanePairs, with
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 SHIFT_ROUNDS: Final = 3
-PULLED: Final = 1e-6
+PRIOR_WEIGHT: Final = 1e-6
 """Weight that keeps shifts near 0 in directions that the images do not determine."""
-EVIDENCE: Final = 6.0
+MIN_EVIDENCE: Final = 6.0
 """Gain in log likelihood from which frames count as moving, as in `fitted_motion`."""
-WIDER: Final = 1.5
+ERROR_FACTOR: Final = 1.5
 """Factor on the errors estimated from disagreements and noise (assumed)."""
-LARGER: Final = 5.0
+MIN_SQUARE_RATIO: Final = 5.0
 """Least ratio of squares of shifts to those of their errors (assumed)."""
 LEAST_TOLD: Final = 0.1
 """Share of the slopes' squares that is the object's is taken to be this at least."""
@@ -66,13 +66,13 @@ def find_shifts(
     scatter = (free @ system.solve(noise)).var(axis=0) / np.square(told)
     # What planes disagree by beyond noise (sampling, beam hardening) is in the shifts as well.
     # A face along the beam is sampled alike in all pairs of a frame: more than they tell.
-    scatter *= WIDER**2 * max(1.0, system.power(system.rest) / system.power(noise))
+    scatter *= ERROR_FACTOR**2 * max(1.0, system.power(system.rest) / system.power(noise))
     found = values.var(axis=0)
     sigmas, evidence = np.zeros((n, 2)), []
     for i, (s, v) in enumerate(zip(scatter.tolist(), found.tolist(), strict=True)):
         gain = n / 2 * (v / s - 1.0 - math.log(v / s)) if v > s else 0.0
         evidence.append(gain)
-        share = 1.0 - s / v if gain > EVIDENCE and v > LARGER * s else 0.0
+        share = 1.0 - s / v if gain > MIN_EVIDENCE and v > MIN_SQUARE_RATIO * s else 0.0
         values[:, i] *= share
         sigmas[:, i] = math.sqrt(share * s) if share else math.nan
     return Shifts(values, sigmas, (evidence[0], evidence[1]))
@@ -96,7 +96,7 @@ class _System:
         self.normal = np.zeros((n, n))
         blocks = np.einsum("qak,qbk,q->qab", self.slopes, self.slopes, self.weight, optimize=True)
         np.add.at(self.normal, (self.places[:, :, None], self.places[:, None]), blocks)
-        self.normal[np.diag_indices(n)] += PULLED * np.trace(self.normal) / n + 1e-300
+        self.normal[np.diag_indices(n)] += PRIOR_WEIGHT * np.trace(self.normal) / n + 1e-300
 
     def _difference(self, found: FloatArray) -> FloatArray:
         return without(self.ones, found[:, 0] - found[:, 1], self.pairs.valid)

@@ -31,7 +31,7 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 CHANCE: Final = 0.1
 """Probability that a panel has a gap at one of the columns where it is hidden; assumed."""
-TOLD_ODDS: Final = 100.0
+REPORTED_ODDS: Final = 100.0
 """Odds of a gap from which it is reported."""
 WIDTHS_PX: Final = np.arange(0.25, 3.01, 0.25)
 """Widths of gaps that are tried [px]."""
@@ -39,17 +39,17 @@ WIDTH_SPREAD_PX: Final = 1.0
 """Standard deviation of the widths of gaps before the images [px]; assumed."""
 BLURS_PX: Final = (0.0, 1.0)
 """Standard deviations over which a gap is smeared that are tried [px]."""
-SHARES: Final = np.array([0.3, 0.65, 1.0])
+EVIDENCE_SHARES: Final = np.array([0.3, 0.65, 1.0])
 """Shares of the gap's expected evidence that blurred edges may leave."""
-FREEDOM: Final = 8.0
+SCATTER_FREEDOM: Final = 8.0
 """Degrees of freedom of the scatter of evidence (Student): a third of the fewest borders."""
 LEAST_COLUMNS: Final = 14
 """Columns on each side of the axis whose borders are compared, at least."""
-EDGES: Final = 0.2
+EDGE_SHARE: Final = 0.2
 """Part of all places there that is compared, those with most change."""
 MOST_EDGES: Final = 30_000
 """Places that are compared, at most."""
-LEAST_PX: Final = 0.3
+MIN_HIDDEN_PX: Final = 0.3
 """Width of gaps that are not hidden where both ends of rays determine steps to a third of
 it [px]."""
 SIGMAS: Final = 3.0
@@ -67,7 +67,7 @@ class HiddenGap(NamedTuple):
         first, last: columns at which it may begin.
         chance: probability that there is one.
         width_px: root mean square of its width, no gap included [px].
-        likely: the gap, where its odds exceed TOLD_ODDS.
+        likely: the gap, where its odds exceed REPORTED_ODDS.
     """
 
     first: int
@@ -143,7 +143,7 @@ def hidden_gap(
     best = int(odds.argmax())
     return HiddenGap(
         int(shown[0]), int(shown[-1]), total / (1.0 + total), math.sqrt(mean_square),
-        _gap_at(int(columns[best]), evidence.widths[:, best]) if total > TOLD_ODDS else None,
+        _gap_at(int(columns[best]), evidence.widths[:, best]) if total > REPORTED_ODDS else None,
     )  # fmt: skip
 
 
@@ -158,7 +158,7 @@ def _hidden_radius(profile: Profile, smoothing: float) -> float:
     """Return the distance from the axis up to which both ends of rays do not determine
     steps [px].
     """
-    told = np.array([SIGMAS * profile.at(r).sigma < LEAST_PX for r in profile.radii.tolist()])
+    told = np.array([SIGMAS * profile.at(r).sigma < MIN_HIDDEN_PX for r in profile.radii.tolist()])
     inner = 2.0 * smoothing
     if not told.any():
         return max(inner, float(profile.radii[-1]))
@@ -184,7 +184,7 @@ def _evidence(images: FloatArray) -> Evidence:
     table = (images - images.mean(axis=0)).reshape(-1, images.shape[2])
     around = np.lib.stride_tricks.sliding_window_view(np.diff(table, axis=1), 2 * SIDE - 1, axis=1)
     power = np.square(around).sum(axis=2)
-    share = min(EDGES, MOST_EDGES / power.size)
+    share = min(EDGE_SHARE, MOST_EDGES / power.size)
     row, border = np.nonzero(power > np.quantile(power, 1.0 - share))
     places, of_frame = power.shape[1], row // images.shape[1]
     shape = len(BLURS_PX), len(WIDTHS_PX), places
@@ -237,12 +237,14 @@ def _beside_others(gains: FloatArray) -> Judged:
     excess = (whole - usual) / spread
     # Where the model fits, a gap gains what it loses elsewhere, and its variance is twice its mean.
     lost = max(-2.0 * usual, 0.0)
-    short = np.minimum(excess - SHARES[:, None] * lost / spread, 0.0)
-    found = np.logaddexp.reduce(_log_student(short), axis=0) - math.log(len(SHARES))
+    short = np.minimum(excess - EVIDENCE_SHARES[:, None] * lost / spread, 0.0)
+    found = np.logaddexp.reduce(_log_student(short), axis=0) - math.log(len(EVIDENCE_SHARES))
     found = found - _log_student(np.maximum(excess, 0.0))
     return Judged(np.asarray(found), whole, min(lost / spread**2, 1.0))
 
 
 def _log_student(deviation: FloatArray) -> FloatArray:
     """Give the logarithm of Student's density but for a constant."""
-    return np.asarray(-(FREEDOM + 1.0) / 2.0 * np.log1p(np.square(deviation) / FREEDOM))
+    return np.asarray(
+        -(SCATTER_FREEDOM + 1.0) / 2.0 * np.log1p(np.square(deviation) / SCATTER_FREEDOM)
+    )

@@ -36,12 +36,12 @@ BLOCKS: Final = 16
 """Number of blocks of rows, and of columns, whose scatter is compared with the noise's."""
 NEAR_PX: Final = 2.0
 """Edges along rows and columns are looked for in neighbourhoods of this width [px]."""
-SEEN: Final = 3.0
+MIN_EDGE_SIGMAS: Final = 3.0
 """Standard deviations of the noise from which edges count."""
 ROUNDS: Final = 15
 REACH: Final = 0.12
 """Largest distance of the axis from its nominal column, as a share of the columns."""
-OVERLAP: Final = 0.125
+MIN_OVERLAP: Final = 0.125
 """Least share of the columns with a mirror image."""
 
 
@@ -97,7 +97,7 @@ def first_column(mean: FloatArray, nominal: float) -> tuple[float, float]:
     cost = np.full(len(twice), np.inf)
     for i, k in enumerate(twice):
         a = np.arange(max(0, k - cols + 1), min(cols, k + 1))
-        if len(a) < OVERLAP * cols:
+        if len(a) < MIN_OVERLAP * cols:
             continue
         left, right = bands[:, a], bands[:, k - a]
         spread = np.square(left - left.mean(axis=1, keepdims=True)).sum()
@@ -251,7 +251,7 @@ class _Level:
         inside &= self.at[0] < image[0]
         for column in (self.at[0], image[0]) if self.border is not None else ():
             inside &= np.abs(column - self.border + 0.5) > 1.0 + 2.5 * self.sigma
-        if inside.sum() < max(100.0, OVERLAP / 4 * self.at.shape[1]):
+        if inside.sum() < max(100.0, MIN_OVERLAP / 4 * self.at.shape[1]):
             return None
         return _MirrorPairs(self, here, self.at[:, inside])
 
@@ -428,7 +428,7 @@ def _edges(mean: FloatArray, noise: FloatArray) -> tuple[FloatArray, float]:
         return np.asarray(np.abs(gaussian_filter(change * wave, NEAR_PX, mode="nearest")))
 
     half, quarter = at(np.pi), at(np.pi / 2)
-    seen = np.square(quarter) > SEEN**2 * noise / (2.0 * math.pi * NEAR_PX**2)
+    seen = np.square(quarter) > MIN_EDGE_SIGMAS**2 * noise / (2.0 * math.pi * NEAR_PX**2)
     left = min(1.0, half[seen].sum() / max(quarter[seen].sum(), 1e-30))
     return np.where(seen, quarter, 0.0), left
 

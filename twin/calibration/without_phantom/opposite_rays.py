@@ -42,15 +42,15 @@ MOST_PAIRS: Final = 30_000
 """Pairs of views that are used, evenly chosen of more; for the first search a tenth of them."""
 FEWEST_PAIRS: Final = 50
 ROUNDS: Final = 15
-LIFT: Final = 0.25
+MAX_LIFT_PX: Final = 0.25
 """Largest difference of a leaning ray and its opposite at the edge of the field of view,
 for rows outside the source's plane to count [px]."""
-EDGE: Final = 2
+EDGE_ROWS: Final = 2
 """Rows around each view's that a cubic spline needs."""
 PATCH, SECTORS = 6.0, 24
 """Sigmas of the smoothing that a patch of like differences is wide, in columns of both ends, and
 sectors of the views that are as many patches."""
-CLEAN: Final = 0.5
+MIN_SIGNAL_RATIO: Final = 0.5
 """Least ratio to noise of the images behind the slopes."""
 
 
@@ -86,7 +86,7 @@ class OppositeRays:
         behind = np.abs((azimuth - azimuth[:, None]) % (2 * np.pi) - np.pi) < 2 * fan
         pairs = np.argwhere(np.triu(behind, 1))
         self.pairs = pairs[:: -(-len(pairs) // MOST_PAIRS) or 1]
-        half = LIFT / math.tan(fan)
+        half = MAX_LIFT_PX / math.tan(fan)
         self.lifts = np.unique([-half, 0.0, half] if len(frames[0]) > 1 else [0.0])
         if (count := int(self._places(start, self.pairs)[1].sum())) < FEWEST_PAIRS:
             around = np.sort(azimuth % (2 * np.pi))
@@ -158,7 +158,7 @@ class _Level:
         soft = gaussian_filter(images, (0, self.sigma, self.sigma))
         for axis in (1, 2):
             soft = spline_filter1d(soft, axis=axis, output=np.float32)
-        soft = np.pad(soft, ((0, 0), (EDGE, EDGE), (0, 0)), "reflect")
+        soft = np.pad(soft, ((0, 0), (EDGE_ROWS, EDGE_ROWS), (0, 0)), "reflect")
         return soft.reshape(-1, soft.shape[2])
 
     def read(
@@ -167,7 +167,7 @@ class _Level:
         """Read the values of both views of pairs, (2, q, lifts)."""
         rows = self.rays.frames.shape[1]
         row = places[:, 1, :, None] + self.rays.lifts - self.rays.top
-        row = np.clip(row, 0, rows - 1) + EDGE + pairs.T[:, :, None] * (rows + 2 * EDGE)
+        row = np.clip(row, 0, rows - 1) + EDGE_ROWS + pairs.T[:, :, None] * (rows + 2 * EDGE_ROWS)
         column = np.broadcast_to(places[:, 0, :, None], row.shape)
         return read_spline(image, np.stack([column, row]))
 
@@ -200,7 +200,7 @@ class _Level:
             rest, slopes, noise, noisy, w = self._equations(values, pairs)
             alone = (noisy * w) @ noisy.T
             information = (slopes * w) @ slopes.T - alone
-            if not information[0, 0] > CLEAN * alone[0, 0]:
+            if not information[0, 0] > MIN_SIGNAL_RATIO * alone[0, 0]:
                 break
             score = (slopes * w) @ rest
             scatter = self._scatter(slopes * w, rest, pairs, values)

@@ -26,19 +26,19 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 Views = Callable[[FloatArray], ConeVec]
 """The panel's height [px], and doubtful parameters, to all views; the axis at the origin."""
 
-APART: Final = (0.2, 0.3, 0.38, 0.43, 0.455, 0.47, 0.48)
+PAIR_DISTANCES: Final = (0.2, 0.3, 0.38, 0.43, 0.455, 0.47, 0.48)
 """Distances of the two views of a pair, in turns."""
-CLEAR: Final = 1.05
+MIN_CLEARANCE: Final = 1.05
 """Least distance of the line through two sources from the axis, relative to the object's
 radius."""
-AIR: Final = 0.005
+MAX_AIR_SHARE: Final = 0.005
 """Largest share of the mean's largest value that counts as air (assumed)."""
-NOISE: Final = 7.0
+AIR_SIGMAS: Final = 7.0
 """Standard deviations of the mean's noise above which it is no air."""
 LEVELS: Final = ((1, 0), (2, 0), (4, 0), (1, 8), (2, 8), (4, 8), (2, 20), (4, 20))
 """Bins of planes, and degrees between pairs, whose differences are added before they are
 squared."""
-ROWS: Final = 2
+ROWS_PER_BIN: Final = 2
 """Rows to a bin."""
 FEWEST_BINS: Final = 4
 """Least number of complete bins of a pair that counts."""
@@ -73,14 +73,16 @@ class PlanePairs:
         np.cumsum(frames.transpose(0, 2, 1), axis=2, out=self.sums[:, :, 1:])
         here = self.rows(start)
         radius, border = _support(frames, binned_mean(mean, factor), here[0])
-        table = np.array([(i, (i + round(part * n)) % n) for part in APART for i in range(n)])
-        kind = np.repeat(np.arange(len(APART)), n)
+        table = np.array(
+            [(i, (i + round(part * n)) % n) for part in PAIR_DISTANCES for i in range(n)]
+        )
+        kind = np.repeat(np.arange(len(PAIR_DISTANCES)), n)
         sources = here[:, :2]
         along = sources[table[:, 1]] - sources[table[:, 0]]
         along /= np.linalg.norm(along, axis=1)[:, None]
         inwards = np.column_stack([-along[:, 1], along[:, 0]])
         away = -(inwards * sources[table[:, 0]]).sum(axis=1)
-        clear = np.abs(away) > CLEAR * radius
+        clear = np.abs(away) > MIN_CLEARANCE * radius
         if clear.sum() < n:
             raise NotIdentifiableError(
                 f"the object reaches {radius:.4g} mm from the axis, the source is "
@@ -93,7 +95,7 @@ class PlanePairs:
         self.starts = np.flatnonzero(np.diff(kind, prepend=-1))
         self.sizes = np.diff(self.starts, append=len(kind))
         self.place = np.arange(len(kind)) - np.repeat(self.starts, self.sizes)
-        at = np.arange(0, rows + 1, ROWS) - rows / 2
+        at = np.arange(0, rows + 1, ROWS_PER_BIN) - rows / 2
         to = here[0, 3:6] - here[0, :3] + at[:, None] * here[0, 9:12]
         flat = here[0, :2]
         self.heights = np.sort(-to[:, 2] / (to[:, :2] @ flat) * (flat @ flat))
@@ -315,7 +317,9 @@ def _support(
         air = float(np.percentile(rim, 25))
         change = np.square(np.diff(images, 2, axis=2)) / 6
         white = float(np.median(change)) / MEDIAN_OF_CHI_SQUARE / (16 * math.pi)
-        full |= soft > air + max(AIR * (float(soft.max()) - air), NOISE * math.sqrt(white))
+        full |= soft > air + max(
+            MAX_AIR_SHARE * (float(soft.max()) - air), AIR_SIGMAS * math.sqrt(white)
+        )
     seen = np.flatnonzero(full.any(axis=0))
     if len(seen) == 0:
         raise NotIdentifiableError("the mean shows nothing but air")

@@ -18,21 +18,21 @@ from flexdt.twin.calibration.without_phantom.plane_pairs import PlanePairs
 from flexdt.twin.errors import NotIdentifiableError
 from flexdt.twin.geometry.conventions import FloatArray
 
-GRID: Final = 25
+GRID_HEIGHTS: Final = 25
 """Number of heights that are tried first."""
-SURE: Final = 2.0
+MIN_LEAD_SIGMAS: Final = 2.0
 """Standard deviations by which the best of them must be better than any that is not its
 neighbour."""
-BENT: Final = 2.5
+MIN_BEND_SIGMAS: Final = 2.5
 """Least curvature of the minimum, in its own standard deviations."""
-LEFT: Final = 0.05
+MIN_BEND_SHARE: Final = 0.05
 """Least share of the curvature left without any two neighbouring blocks of heights."""
 ROUNDS: Final = 8
 FREE_ROUNDS: Final = 3
 """In which the level may change."""
-NOISY: Final = 4
+NOISE_STEPS: Final = 4
 """Steps to either side of the minimum at which noise alone is evaluated."""
-ELSEWHERE: Final = "the views agree about as well with the source's plane at another row"
+NO_MINIMUM: Final = "the views agree about as well with the source's plane at another row"
 
 
 class _Bowl(NamedTuple):
@@ -61,19 +61,19 @@ def find_height(
             small.
     """
     up = np.eye(len(fine.start))[0]
-    bowl, at, h = _settle(fine, coarse, np.linspace(-reach, reach, GRID), up, random)
+    bowl, at, h = _settle(fine, coarse, np.linspace(-reach, reach, GRID_HEIGHTS), up, random)
     alone = fine.noise(random)
-    places = at + h * np.arange(-NOISY, NOISY + 1)
+    places = at + h * np.arange(-NOISE_STEPS, NOISE_STEPS + 1)
     costs = [fine.costs(fine.start + y * up, alone) * bowl.scale for y in places]
     noise = np.stack([fine.total(c) for c in costs])
     slopes, bends = (noise[2:] - noise[:-2]) / (2 * h), np.diff(noise, 2, axis=0) / h**2
     blurred = np.sqrt(np.square(slopes).mean(axis=0)) / bowl.bends
-    flat = bowl.bends < BENT * np.sqrt(np.square(bends).mean(axis=0))
+    flat = bowl.bends < MIN_BEND_SIGMAS * np.sqrt(np.square(bends).mean(axis=0))
     sigmas = np.where(flat | (bowl.bends <= 0), np.inf, np.maximum(bowl.sigmas, blurred))
     level = int(sigmas.argmin())
     sigma, at = float(sigmas[level]), float(bowl.aims[level])
     if not math.isfinite(sigma):
-        raise NotIdentifiableError(ELSEWHERE)
+        raise NotIdentifiableError(NO_MINIMUM)
     others = bowl.aims[sigmas < 2 * sigma]
     variance = sigma**2 + float(np.square(others - at).mean())
 
@@ -118,7 +118,7 @@ def _settle(
         if n > 0 and abs(step) < 0.2 * sigma + 0.01:
             return bowl, at, h
         at, h = at + step, max(min(h, 4 * sigma), 0.5)
-    raise NotIdentifiableError(ELSEWHERE)
+    raise NotIdentifiableError(NO_MINIMUM)
 
 
 def _first(
@@ -152,9 +152,10 @@ def _first(
             better = pairs.total(more) / np.maximum(spread, 1e-300)
             found.append((float(better.min()), float(grid[best])))
     sure, height = max(found, default=(0.0, 0.0))
-    if sure < SURE:
+    if sure < MIN_LEAD_SIGMAS:
         raise NotIdentifiableError(
-            f"{ELSEWHERE} (the best is better by {sure:.1f} standard deviations; at least {SURE:g})"
+            f"{NO_MINIMUM} (the best is better by {sure:.1f} standard deviations; "
+            f"at least {MIN_LEAD_SIGMAS:g})"
         )
     return height
 
@@ -169,12 +170,14 @@ def _bowl(pairs: PlanePairs, at: float, h: float, up: FloatArray) -> _Bowl:
     left = pairs.spread(slopes - steps[:, None] * bends, blocks=True)
     sure = bend / np.maximum(pairs.spread(bends), 1e-300)
     # Of several levels the one that happens to bend most would be chosen, its sigma too small.
-    wider = np.hypot(1.0, BENT / np.maximum(sure, BENT))
-    sigmas = np.where(sure > BENT, wider * left / np.where(sure > BENT, bend, 1.0), np.inf)
+    wider = np.hypot(1.0, MIN_BEND_SIGMAS / np.maximum(sure, MIN_BEND_SIGMAS))
+    sigmas = np.where(
+        sure > MIN_BEND_SIGMAS, wider * left / np.where(sure > MIN_BEND_SIGMAS, bend, 1.0), np.inf
+    )
     # No two neighbouring blocks of heights may have the answer to themselves: a flat face would.
     parts = pairs.blocks(np.stack([slopes, bends])).sum(axis=-2)
     rest_slope, rest_bend = np.stack([slope, bend])[..., None] - parts[..., 1:] - parts[..., :-1]
-    alone = ~(rest_bend > np.maximum(LEFT * bend[:, None], 0.0))
+    alone = ~(rest_bend > np.maximum(MIN_BEND_SHARE * bend[:, None], 0.0))
     without = rest_slope / np.where(alone, 1.0, rest_bend) - steps[:, None]
     doubt = np.where(alone, np.inf, np.abs(without) / 2).max(axis=1)
     sigmas = np.maximum(sigmas, doubt)

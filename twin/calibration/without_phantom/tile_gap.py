@@ -36,7 +36,7 @@ WIDTHS: Final = np.arange(0.0, 4.01, 0.1)
 """Trial widths of gaps [px]."""
 ROWS, FRAMES = 48, 96
 """Rows that a frame is averaged to, and frames that are looked at, where there are more."""
-EDGES: Final = 0.05
+EDGE_SHARE: Final = 0.05
 """Part of all places that is compared, those with most change: edges. Noise has no
 information."""
 LEAST_VARIANCE: Final = 0.02
@@ -105,7 +105,7 @@ def local_gaps(
     around = np.lib.stride_tricks.sliding_window_view(steps, 2 * SIDE - 1, axis=1)
     power = np.square(around).sum(axis=2)
     power[:, np.lib.stride_tricks.sliding_window_view(dead, 2 * SIDE).any(axis=1)] = 0.0
-    row, border = np.nonzero(power > np.quantile(power, 1.0 - EDGES))
+    row, border = np.nonzero(power > np.quantile(power, 1.0 - EDGE_SHARE))
     if not len(row):
         return []
     edges = around[row, border] / np.sqrt(power[row, border])[:, None]

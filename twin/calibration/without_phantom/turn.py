@@ -31,19 +31,19 @@ DARKEST: Final = 8.0
 """Largest line integral in the model of noise; above it the noise is constant."""
 MEDIAN_OF_CHI_SQUARE: Final = 0.4549
 """Of one degree of freedom."""
-WHITE: Final = 3.0
+WHITE_SIGMAS: Final = 3.0
 """Standard deviations of white noise's correlation up to which neighbouring pixels are
 independent. From twice that on they are not."""
-LOST: Final = 2.5
+LOST_RATIO: Final = 2.5
 """Ratio of a difference of frames to the usual one above which a frame may be missing:
 with one missing it is about four."""
-STEPS: Final = 5.0
+MIN_STEP_RATIO: Final = 5.0
 """Least ratio of a step between neighbours to the usual spread (assumed)."""
-CLEAR: Final = 1.5
+MIN_LEAD_RATIO: Final = 1.5
 """Least ratio of it to the next largest elsewhere: faces along the beam leave several."""
-FEWEST: Final = 24
+MIN_DIRECTIONS: Final = 24
 """Least number of directions for a mean."""
-BACK: Final = 0.3
+MAX_RETURN_SHARE: Final = 0.3
 """Sum of two steps relative to one below which they are one to and fro (assumed)."""
 WIDEST_GAP: Final = 4.5
 """Largest gap between neighbouring angles, relative to the usual one: three frames missing."""
@@ -169,9 +169,9 @@ def _require_turn(angle: FloatArray) -> tuple[FloatArray, float]:
     around = angle % (2 * np.pi)
     gaps = np.diff(around, append=around[:1] + 2 * np.pi)
     own = gaps[gaps > 1e-6]
-    if len(own) < FEWEST:
+    if len(own) < MIN_DIRECTIONS:
         raise NotIdentifiableError(
-            f"{len(own)} directions; the mean over a turn needs {FEWEST} at least",
+            f"{len(own)} directions; the mean over a turn needs {MIN_DIRECTIONS} at least",
         )
     usual, widest = float(np.median(own)), float(own.max())
     if widest > WIDEST_GAP * usual:
@@ -256,14 +256,14 @@ def _repeated(views: Float32Array, gaps: FloatArray) -> tuple[list[int], list[in
     usual = median_filter(change, 5, mode="wrap")
     turned = np.roll(gaps, 1) > 1e-6
     ratio = change / np.maximum(usual, 1e-30)
-    limit = WHITE / math.sqrt(views[0].size)
+    limit = WHITE_SIGMAS / math.sqrt(views[0].size)
     white = correlation <= limit
     white &= median_filter(correlation, 5, mode="wrap") > 2.0 * limit
     same = np.flatnonzero(white & (ratio <= np.quantile(ratio, 0.1)) & turned)
     if len(same) > len(views) // 4:
         return [], []
     jump = np.where(np.roll(gaps, 1) < 1.5 * np.median(gaps), ratio, 0.0)
-    return same.tolist(), [int(jump.argmax())] if jump.max() > LOST else []
+    return same.tolist(), [int(jump.argmax())] if jump.max() > LOST_RATIO else []
 
 
 def _neighbours_correlation(image: FloatArray) -> float:
@@ -309,7 +309,7 @@ def _step(views: Float32Array, gaps: FloatArray, first: int) -> tuple[tuple[floa
         shifts[i] = -np.linalg.solve(normal, slopes @ rest[i].ravel())
     even = np.abs(gaps / np.median(gaps) - 1.0) < 0.1
     valid = np.all([np.roll(even, by) for by in (-1, 0, 1, 2)], axis=0)
-    if valid.sum() < FEWEST // 2:
+    if valid.sum() < MIN_DIRECTIONS // 2:
         return (0.0, 0.0), 0
     spread = 1.4826 * np.median(np.abs(shifts[valid]), axis=0) + 1e-6
     score = np.where(valid, np.abs(shifts / spread).max(axis=1), 0.0)
@@ -317,10 +317,12 @@ def _step(views: Float32Array, gaps: FloatArray, first: int) -> tuple[tuple[floa
     others = np.where(_far(n, worst), score, 0.0)
     # What steps and stays has to step back between the last frame and the first.
     back = int(others.argmax()) if worst == first else first
-    if np.linalg.norm(shifts[back] + shifts[worst]) < BACK * np.linalg.norm(shifts[worst]):
+    if np.linalg.norm(shifts[back] + shifts[worst]) < MAX_RETURN_SHARE * np.linalg.norm(
+        shifts[worst]
+    ):
         others = np.where(_far(n, back), others, 0.0)
         worst = back if worst == first else worst
-    if score[worst] < max(STEPS, CLEAR * others.max()):
+    if score[worst] < max(MIN_STEP_RATIO, MIN_LEAD_RATIO * others.max()):
         return (0.0, 0.0), 0
     return (float(shifts[worst, 0]), float(shifts[worst, 1])), (worst - 1) % n
 
