@@ -1,1 +1,1 @@
-"""The scanner in 3-D: what viser draws for a state of the twin."""
+"""The scanner in 3-D: viser's scene of a state of the twin."""

@@ -1,12 +1,13 @@
 """The beam's light in the air, in two faint planes through the focal spot.
 
-It is whole before the sample, and behind it as much as came through. The planes are those of the
-image's middle column and row. A place behind the sample has the transmission of the pixel at which
-its ray ends, so the shadow stands in the air. A look through all of it passes one sheet of each
-plane, and keeps half of what lies behind. The ball around the sample is left out: where in it light
-is lost no radiograph says, and a plane through a transparent sample would hide half of it. The
-cone's sides are its edges alone: viser draws a translucent mesh in front of or behind all of the
-sample, whatever lies between (`web/translucent.ts`). Units: mm, m for viser.
+It has full strength before the sample, and the transmitted part behind it. The planes are
+those of the image's middle column and row. A place behind the sample has the transmission
+of the pixel at which its ray ends, so the shadow is visible in the air. A look through
+all of it passes one sheet of each plane, and keeps half of the background. The ball
+around the sample is left out: a radiograph does not show where in it light is lost, and a
+plane through a transparent sample would hide half of it. The cone's sides are its edges
+alone: viser draws a translucent mesh in front of or behind all of the sample, whatever is
+between (`web/translucent.ts`). Units: mm, m for viser.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ SHAPE: Final = (160, 192)
 """Rows and columns of each plane's picture."""
 LIGHT: Final = (255, 176, 32)
 MOST: Final = 66
-"""Opacity of the whole beam in a plane, of 255."""
+"""Largest opacity of the beam in a plane, of 255."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +70,15 @@ def fans(world: World, lines: npt.NDArray[np.generic], radius_mm: float) -> list
 def _fan(
     world: World, across: FloatArray, through: FloatArray, side: float, radius: float
 ) -> BeamPlane:
-    """Rays to a line of pixels through the image's middle, which `across` leads along, before the
-    sample (`side` -1) or behind it (1)."""
+    """Draw the rays to a line of pixels through the image's middle.
+
+    Args:
+        world: geometry.
+        across: direction and length of the line of pixels (3,) [mm].
+        through: transmission of the pixels (n,).
+        side: -1 before the sample, 1 behind it.
+        radius: of the ball around the sample that is left out [mm].
+    """
     along = across / np.linalg.norm(across)
     middle = world.detector - world.source
     ahead = middle - (middle @ along) * along

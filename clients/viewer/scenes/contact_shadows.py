@@ -1,7 +1,8 @@
-"""Soft shadows where one part of the machine stands on another, for every browser.
+"""Soft shadows of parts of the machine on others below them, for every browser.
 
-A shadow is a dark pad with soft edges that lies on the lower part and moves with the upper one. It
-belongs to a GLB, whose translucent materials write no depth in any of viser's versions.
+A shadow is a dark pad with soft edges on the lower part, which moves with the upper one.
+It belongs to a GLB, whose translucent materials write no depth in any of viser's
+versions.
 """
 
 from __future__ import annotations
@@ -20,19 +21,19 @@ from flexdt.twin.collision.stages import Body
 from flexdt.twin.machine.description import Component
 
 SIDE_PX: Final = 48
-"""Rows and columns of a shadow's picture."""
+"""Number of rows and columns of a shadow's picture."""
 DARKEST: Final = 0.55
-"""Opacity under the part itself."""
+"""Opacity of a shadow under the part itself."""
 SPREAD: Final = 0.16
-"""Part of the part's own size by which its shadow reaches beyond each side."""
+"""Reach of a shadow beyond each side, over the part's own size."""
 ABOVE_MM: Final = 0.8
-"""Height of a shadow above what it falls on."""
+"""Height of a shadow above the surface below it [mm]."""
 TOUCHING_MM: Final = 12.0
-"""Gap between two parts up to which the upper one stands on the lower one."""
+"""Largest gap between two parts of which the upper one rests on the lower one [mm]."""
 
 
 def standing(parts: Sequence[Component], bodies: Mapping[str, Body]) -> dict[str, float]:
-    """Name the parts that stand on another one, and the height of what they stand on.
+    """List the parts that rest on another one, with the height of its top.
 
     Args:
         parts: of a machine.
@@ -59,11 +60,11 @@ def standing(parts: Sequence[Component], bodies: Mapping[str, Body]) -> dict[str
 
 
 def shadow(part: Component, top_mm: float) -> bytes:
-    """The shadow of a part as a GLB file [m], in the part's own frame.
+    """Make the shadow of a part as a GLB file [m], in the part's own frame.
 
     Args:
         part: that casts it.
-        top_mm: height of what it stands on.
+        top_mm: height of the surface below [mm].
     """
     width, depth, _ = (1.0 + 2.0 * SPREAD) * np.asarray(part.size_mm)
     x, y, _ = part.center_mm
@@ -83,7 +84,7 @@ def shadow(part: Component, top_mm: float) -> bytes:
 
 
 def _soft() -> Image.Image:
-    """A black square whose edges fade, RGBA."""
+    """Draw a black square whose edges fade, RGBA."""
     at = np.abs((np.arange(SIDE_PX) + 0.5) / SIDE_PX * 2.0 - 1.0)
     inner = 1.0 / (1.0 + 2.0 * SPREAD)
     share = np.clip((1.0 - at) / (1.0 - inner), 0.0, 1.0)

@@ -41,8 +41,8 @@ class Gizmos:
 
     Args:
         server: to draw in.
-        machine: whose stages.
-        drag: what to do with a drag.
+        machine: with the stages.
+        drag: called with each drag.
     """
 
     def __init__(self, server: viser.ViserServer, machine: Machine, drag: Drag) -> None:
@@ -70,6 +70,12 @@ class Gizmos:
             handle.control.wxyz = (1.0, 0.0, 0.0, 0.0)
 
     def _add(self, server: viser.ViserServer, stage: str) -> _Handle:
+        """Add the handle of a stage, with arrows for its motors.
+
+        Args:
+            server: to draw in.
+            stage: source, object or detector.
+        """
         active = [bool(self._machine.geometry.get(f"{stage}_{c}")) for c in COORDINATES]
         turns = stage == "object" and bool(self._machine.geometry.get("angle"))
         control = server.scene.add_transform_controls(
@@ -101,6 +107,12 @@ class Gizmos:
         handle.start = dict(self._positions)
 
     def _moved(self, handle: _Handle, event: Any) -> None:
+        """Convert the handle's shift and turn to motor targets and pass them on.
+
+        Args:
+            handle: being dragged.
+            event: of viser, with its client.
+        """
         # The last update of a drag may come after its end, and counts from where the drag began.
         if not handle.start:
             return

@@ -40,11 +40,11 @@ from flexdt.twin.machine.description import Machine, Profile
 LAMP_M: Final = 0.045
 """Radius of the cabinet's lamp in the FleX-ray."""
 CONE: Final = 0.2
-"""Opacity of the whole beam in a picture that needs no browser."""
+"""Opacity of the full beam in a picture that needs no browser."""
 BEAM_OFF: Final = (120, 140, 165)
 SURFACE: Final = (70, 190, 255)
 FADED: Final = 0.12
-"""Opacity of a sample whose volume is drawn within it, at most."""
+"""Largest opacity of a sample whose volume is drawn within it."""
 FLOOR: Final = (140, 150, 165)
 RANGE: Final = (240, 150, 40)
 RED: Final = (230, 50, 40)
@@ -55,7 +55,7 @@ GAP_MM: Final = 0.6
 NEAR: Final = ("sample_mount", "sample_holder")
 """Roles of the parts that turn with the sample."""
 HERE: Final = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-"""The pose of what stands in the world's own frame."""
+"""The pose of parts in the world's own frame."""
 AXIS_REACH_MM: Final = 120.0
 SCALE_MM, AXES_MM = 500.0, 150.0
 
@@ -65,7 +65,7 @@ class LabScene:
 
     Args:
         server: to draw in.
-        machine, profile: what to draw.
+        machine, profile: to draw.
         drag: called when a stage is dragged.
         looks: part -> its own mesh (`own_looks`).
     """
@@ -78,6 +78,7 @@ class LabScene:
         drag: Drag = lambda client, targets: None,
         looks: Mapping[str, bytes] | None = None,
     ) -> None:
+        """Build all nodes, each shown or hidden as in `Shown()`; see the class."""
         self._server, self.machine, self.profile = server, machine, profile
         self._own = looks or {}
         self._collision = build_scene(machine, profile)
@@ -101,11 +102,13 @@ class LabScene:
                 handle: Any = server.scene.get_handle_by_name(node)
                 handle.visible = visible
         self.plain = self.nodes(Shown(), faded=False)
-        """How all nodes are built; each frame is told what its page shows otherwise."""
+        """Properties of all nodes as built; each frame gets the differences of its
+        page."""
 
     # -- building ----------------------------------------------------------------------------
 
     def _build(self) -> None:
+        """Build floor, machine, cabinet, beam, panel and lines, without any state."""
         scene = self._server.scene
         scene.set_up_direction("+z")
         scene.configure_default_lights(enabled=False, cast_shadow=False)
@@ -186,7 +189,7 @@ class LabScene:
                 self._margins[name] = self._hull(f"/machine/{name}/margin", shell, AMBER, 0.25)
 
     def _build_labels(self) -> None:
-        """The world's axes and a scale on the floor."""
+        """Build the world's axes and a scale on the floor."""
         scene, (x, y, z) = self._server.scene, _scale_mm(self.machine)
         ends = np.array([[[x, y, z], [x, y + SCALE_MM, z]]]) * MM
         scene.add_line_segments("/scale", ends, RANGE, thickness=5.0, **SCREEN)
@@ -196,7 +199,7 @@ class LabScene:
         )  # fmt: skip
 
     def named(self, world: World, shown: Shown) -> list[Name]:
-        """What has a name now, and where it is."""
+        """List the names shown now, and their places."""
         if "labels" not in shown:
             return names_of_image(world) if "names" in shown else []
         first = _scale_mm(self.machine)
@@ -216,7 +219,12 @@ class LabScene:
     # -- moving ------------------------------------------------------------------------------
 
     def update(self, state: State, world: World) -> None:
-        """Move everything to a state."""
+        """Move everything to a state.
+
+        Args:
+            state: of the twin; its motors and X-rays.
+            world: geometry of the state.
+        """
         q = self._collision.vector(motors(self.machine, state))
         with self._server.atomic():
             for part in self.machine.components:
@@ -241,6 +249,13 @@ class LabScene:
         frame.wxyz, frame.position = pose[:4], pose[4:]
 
     def _show_beam(self, state: State, world: World) -> None:
+        """Move edges, spot, lamp, cross and axis to a state, and colour them by X-rays on
+        or off.
+
+        Args:
+            state: of the twin.
+            world: geometry of the state.
+        """
         on = state.tube.on
         points = np.concatenate([world.source[None], world.corners]) * MM
         self._lit, self._lamp.color = on, LAMP[on]
@@ -267,12 +282,13 @@ class LabScene:
         self._image.position = tuple(at)
 
     def shapes(self, world: World, shown: Shown, near: bool = False) -> list[Shape]:
-        """What is drawn, for a picture that needs no browser; any thread may ask.
+        """Collect the drawn shapes for a picture that needs no browser; any thread may
+        call.
 
         Args:
             world: of the state that was drawn last.
-            shown: by the page that asks.
-            near: leave out what does not turn with the sample.
+            shown: by the page.
+            near: leave out shapes that do not turn with the sample.
         """
         poses = dict(self._sent)
         turning = {"object", *(part.name for part in self.machine.components if part.role in NEAR)}
@@ -290,7 +306,7 @@ class LabScene:
             out.append(cone(world, LIGHT, CONE))
         return out
 
-    # -- what is seen ------------------------------------------------------------------------
+    # -- visible parts -----------------------------------------------------------------------
 
     def show_image(
         self, rgb: npt.NDArray[np.uint8], lines: npt.NDArray[np.generic], world: World
@@ -303,7 +319,8 @@ class LabScene:
     def show_surface(
         self, vertices_mm: FloatArray | None, faces: npt.NDArray[np.int32] | None = None
     ) -> None:
-        """Draw what a scan has reconstructed so far, on the stage; None: no longer.
+        """Show the volume's surface that a scan has reconstructed so far, on the stage;
+        None removes it.
 
         The sample itself fades meanwhile, so that its volume is seen within it.
 
@@ -328,7 +345,11 @@ class LabScene:
             )  # fmt: skip
 
     def wear(self, look: SampleLook) -> None:
-        """Put a sample on the stage."""
+        """Put a sample on the stage.
+
+        Args:
+            look: its meshes; the former ones are removed.
+        """
         if look is self._look:
             return
         self._look = look
@@ -347,7 +368,11 @@ class LabScene:
         self.plain = self.nodes(Shown(), faded=False)
 
     def _stand(self, look: SampleLook) -> None:
-        """A thin rod from the mount to the sample: drawn only, X-rays do not see it."""
+        """Draw a thin rod from the mount to the sample; X-rays do not see it.
+
+        Args:
+            look: the sample; without meshes there is no rod.
+        """
         name = f"{STAND}/rod"
         mount = next((p for p in self.machine.components if p.role == "sample_mount"), None)
         known = self._server.scene.get_handle_by_name(name)
@@ -364,7 +389,7 @@ class LabScene:
             self._server.scene.add_glb(name, glb([rod]), receive_shadow=False)
 
     def nodes(self, shown: Shown, near: Collection[str] = (), faded: bool = True) -> Nodes:
-        """The nodes of all layers, for frames of a page that shows `shown`.
+        """Collect the nodes of all layers, for frames of a page that shows `shown`.
 
         Args:
             near: components near a contact, whose collision bodies and margins are drawn, too.
@@ -384,7 +409,11 @@ class LabScene:
         return {node: on for node, on in wanted.items() if there(node) is not None}
 
     def draw_ranges(self, state: State) -> None:
-        """Draw the remaining travel of each stage as a line through its position."""
+        """Draw the remaining travel of each stage as a line through its position.
+
+        Args:
+            state: of the twin.
+        """
         q = self._collision.vector(motors(self.machine, state))
         lines = []
         for part in self.machine.components:
@@ -405,14 +434,16 @@ class LabScene:
 
 
 def _clear(opacity: float, dense: bool) -> dict[str, Any]:
-    """Of a skin: what is dense stays opaque; the rear of what is not is seen, too."""
+    """Choose opacity and sides of a skin: dense ones stay opaque, others show their
+    rear, too."""
     opaque = opacity >= 1.0
     side = "front" if opaque else "double"
     return {"opacity": None if dense or opaque else opacity, "side": side}
 
 
 def _scale_mm(machine: Machine) -> FloatArray:
-    """Where the scale begins: beside the part on which the others stand, on its top."""
+    """Compute the place of the scale: next to the lowest part, at the height of its
+    top."""
     ground = ground_of(machine)
     (x, y, z), middle = ground.size_mm, np.array(ground.center_mm)
     return np.asarray(middle + [0.45 * x, -0.4 * y, z / 2 + 2.0])

@@ -14,11 +14,11 @@ GROUND: Final = (120, 116, 112)
 SKY_COLOR: Final = (236, 242, 255)
 KEY, KEY_AT = "/lights/key", (1.8, -2.2, 3.2)
 FILL_AT: Final = (-2.6, 1.4, 1.2)
-"""Where light comes from [m]."""
+"""Position of the fill light [m]."""
 
 
 def light_plainly(scene: viser.SceneApi) -> None:
-    """Lamps without shadows, for all clients."""
+    """Set lamps without shadows, for all clients."""
     scene.configure_environment_map(None)
     scene.add_light_hemisphere(SKY, sky_color=SKY_COLOR, ground_color=GROUND, intensity=1.35)
     scene.add_light_directional(KEY, intensity=2.5, position=KEY_AT)
@@ -26,10 +26,11 @@ def light_plainly(scene: viser.SceneApi) -> None:
 
 
 def light_finely(scene: viser.SceneApi) -> None:
-    """A room that shines in metal and lights from all around, and a lamp that casts shadows.
+    """Set a room that shines in metal and lights from all around, and a lamp that casts
+    shadows.
 
     Args:
-        scene: of one client; its lamps take the place of those that all have.
+        scene: of one client; its lamps replace those of all clients.
     """
     scene.configure_environment_map("studio", environment_intensity=0.1)
     scene.add_light_hemisphere(SKY, sky_color=SKY_COLOR, ground_color=GROUND, intensity=1.1)

@@ -1,7 +1,7 @@
-"""The layers of the scenes; what a page shows of them is each person's own choice (`Shown`).
+"""The layers of the scenes; each person chooses the shown ones (`Shown`).
 
-`LAYERS` is the one list: the page's boxes, the methods' parameters and the nodes that the scenes
-show or hide are made from it.
+`LAYERS` is the one list: the page's boxes, the methods' parameters and the nodes that the
+scenes show or hide are made from it.
 """
 
 from __future__ import annotations
@@ -16,13 +16,14 @@ Nodes = Mapping[str, Mapping[str, Any]]
 
 @dataclass(frozen=True)
 class Layer:
-    """What a page shows or hides as a whole.
+    """Group of nodes that a page shows or hides together.
 
     Attributes:
         name: on the wire.
         title: of its box on the page.
-        shown: until somebody chooses.
-        nodes: names of its nodes in the scene, where `{part}` stands for each component; none for
+        shown: by default.
+        nodes: names of its nodes in the scene, where `{part}` is replaced by each
+            component; none for
             names, which each view has drawn for itself.
         near: show the components near a contact, whatever is chosen.
     """
@@ -67,7 +68,7 @@ LAYERS: Final[tuple[Layer, ...]] = (
 
 
 def first_shown() -> frozenset[str]:
-    """Name the layers that are shown until somebody chooses."""
+    """Name the layers that are shown by default."""
     return frozenset(layer.name for layer in LAYERS if layer.shown)
 
 
@@ -82,7 +83,7 @@ class Shown:
         return layer in self.layers
 
     def changed(self, opacity: float | None = None, **layers: bool | None) -> Shown:
-        """The same, but for what is given.
+        """Replace the opacity and some layers in a copy.
 
         >>> sorted(Shown(frozenset(["beam", "axis"])).changed(axis=False, names=True).layers)
         ['beam', 'names']

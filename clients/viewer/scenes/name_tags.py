@@ -1,9 +1,9 @@
-"""Names of what is seen; no name covers another.
+"""Names of visible parts; no name covers another.
 
-Where they stand is a pure function of boxes in pixels. A name's box goes to the free place nearest
-to the point that it names, and a leader joins the two. The names then share these places so that
-their leaders are shortest together: none crosses another. `NameTags` draws them in the views of
-browsers, whose cameras decide where the boxes are.
+Their places are a pure function of boxes in pixels. A name's box goes to the free place
+nearest to its point, and a leader joins the two. The names then share these places so
+that their leaders are shortest together: none crosses another. `NameTags` draws them in
+the views of browsers, whose cameras determine the boxes.
 """
 
 from __future__ import annotations
@@ -22,25 +22,28 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.description import Machine
 
 WAYS, RINGS_PX = 24, (26.0, 44.0, 66.0, 92.0, 124.0, 164.0, 220.0, 300.0, 420.0)
-"""Directions and distances in which a place is looked for, the near ones first."""
+"""Directions, and distances [px], in which a place is sought, the near ones first."""
 GAP_PX = 5.0
-"""Between boxes, and to the picture's edge."""
+"""Least distance between boxes, and to the picture's edge [px]."""
 LETTER_PX, LINE_PX, PAD_PX = 6.6, 17.0, 10.0
-"""Widest letter, height and margin of viser's labels on a screen."""
+"""Widest letter, height and margin of viser's labels on a screen [px]."""
 LEAST_PX = 260
-"""A view that is narrower has no names."""
+"""Least width of a view with names [px]."""
 LEADER: Final = (40, 150, 235)
 Name = tuple[str, FloatArray]
 """Words, and the point (3,) that they name [m, world]."""
 
 
 def laid_out(anchors: FloatArray, sizes: FloatArray, area: tuple[float, float]) -> FloatArray:
-    """Top left corners (n, 2) of the names' boxes; NaN where a name has no room.
+    """Place the names' boxes.
 
     Args:
-        anchors: (n, 2) what is named [px]; NaN or outside the picture: no name.
+        anchors: (n, 2) named points [px]; NaN or outside the picture: no name.
         sizes: (n, 2) widths and heights of the boxes [px].
         area: width and height of the picture [px].
+
+    Returns:
+        Top left corners (n, 2) of the boxes [px]; NaN where a name has no room.
     """
     turns = np.arange(WAYS) * 2.0 * math.pi / WAYS
     ways = np.stack([np.cos(turns), -np.sin(turns)], axis=1)
@@ -67,19 +70,20 @@ def laid_out(anchors: FloatArray, sizes: FloatArray, area: tuple[float, float]) 
 
 
 def leader_end(anchor: FloatArray, corner: FloatArray, size: FloatArray) -> FloatArray:
-    """The point of a box that is nearest to what it names, (2,)."""
+    """Find the point of a box nearest to its anchor, (2,)."""
     return np.clip(anchor, corner, corner + size)
 
 
 def names_of_image(world: World) -> list[Name]:
-    """Source, sample and detector."""
+    """Name source, sample and detector."""
     image = world.detector + world.u * (0.25 * world.shape[1]) - world.normal
     named = ("X-ray source", world.source), ("sample", world.sample.shift), ("detector", image)
     return [(words, at * MM) for words, at in named]
 
 
 def names_of_parts(machine: Machine, poses: Mapping[str, tuple[float, ...]]) -> list[Name]:
-    """Parts that move or have a role, at a corner, from their poses (w, x, y, z, place [m])."""
+    """List parts that move or have a role, at a corner, from their poses (w, x, y, z,
+    place [m])."""
     out = []
     for part in machine.components:
         if (pose := poses.get(part.name)) is not None and (part.axis is not None or part.role):
@@ -97,7 +101,13 @@ class NameTags:
         self._drawn: dict[int, object] = {}
 
     def draw(self, client: viser.ClientHandle, names: Sequence[Name]) -> None:
-        """Put the names where they have room now; nothing is sent while nothing has moved."""
+        """Put the names where they have room now; nothing is sent while nothing has
+        moved.
+
+        Args:
+            client: with its camera.
+            names: words and points [m, world].
+        """
         camera = client.camera
         area = float(camera.image_width), float(camera.image_height)
         names = names if area[0] >= LEAST_PX else ()

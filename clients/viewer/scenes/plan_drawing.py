@@ -42,7 +42,12 @@ class PlanDrawing:
         self._moving = [body for body in collision.bodies if body.name in moving]
 
     def ghost(self, clients: Sequence[viser.ClientHandle], positions: Mapping[str, float]) -> None:
-        """Show some clients where the moving parts would be for motor positions [mm, deg]."""
+        """Show some clients the moving parts at other motor positions.
+
+        Args:
+            clients: that get the ghost.
+            positions: motor -> [mm, deg].
+        """
         q = self._collision.vector(positions)
         for client in clients:
             with client.atomic():
@@ -86,7 +91,8 @@ def _draw_lines(
     clients: Sequence[viser.ClientHandle], name: str, lines: FloatArray | None,
     color: tuple[int, int, int], px: float,
 ) -> None:  # fmt: skip
-    """Lines (n, 2, 3) [mm] in place of those that clients had under this name; None for none."""
+    """Replace the lines (n, 2, 3) [mm] that clients had under this name; None removes
+    them."""
     _remove(clients, name)
     if lines is not None and len(lines):
         for client in clients:

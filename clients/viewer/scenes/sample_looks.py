@@ -1,8 +1,8 @@
 """The sample as coloured meshes, one for each material.
 
-Shipped phantoms are made from their names; meshes of uploads come from the twin, by `sample.mesh`,
-for a bounded time and up to a bounded size. Until an upload's mesh has arrived, and where it has
-too many triangles to send, a box of its size stands in.
+Shipped phantoms are made from their names; meshes of uploads come from the twin, by
+`sample.mesh`, for a bounded time and up to a bounded size. Until an upload's mesh has
+arrived, and where it has too many triangles to send, a box of its size replaces it.
 """
 
 from __future__ import annotations
@@ -97,11 +97,11 @@ class MeshCache:
         self._made: OrderedDict[Key, SampleLook] = OrderedDict()
 
     def lacks(self, sample: SampleState) -> bool:
-        """Whether the sample is an upload whose mesh has not arrived yet."""
+        """Check whether the sample is an upload whose mesh has not arrived yet."""
         return sample.revision is not None and _key(sample) not in self._made
 
     def add(self, sample: SampleState, stl: bytes) -> None:
-        """The shape of an upload.
+        """Store the shape of an upload.
 
         Raises:
             TwinError: it is no mesh.
@@ -111,7 +111,8 @@ class MeshCache:
         self._keep(sample, made)
 
     def look(self, sample: SampleState) -> SampleLook:
-        """How `sample` looks, an upload whose mesh is lacking as a box; it may take a second."""
+        """Return the look of `sample`, an upload whose mesh is lacking as a box; it
+        may take a second."""
         if sample.name is None:
             return NOTHING
         if sample.revision is None and _key(sample) not in self._made:
@@ -126,6 +127,12 @@ class MeshCache:
 
 
 def _skins(phantom: Phantom) -> SampleLook:
+    """Make a phantom's look: one skin for each material, smooth up to a number of
+    triangles.
+
+    Args:
+        phantom: with parts and beads.
+    """
     groups: dict[str, list[trimesh.Trimesh]] = {}
     for part in phantom.parts():
         mesh = part.mesh
@@ -154,7 +161,8 @@ def _box(sample: SampleState) -> SampleLook:
 
 
 async def fetch(ask: Ask, sample: SampleState) -> bytes | None:
-    """The STL of the sample on the stage; None if the sample has changed or is too large.
+    """Get the STL of the sample on the stage; None if the sample has changed or is too
+    large.
 
     Raises:
         ConnectionLost: the twin has gone.

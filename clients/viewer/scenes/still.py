@@ -23,21 +23,21 @@ from flexdt.clients.viewer.scenes.world import MM, World
 from flexdt.twin.geometry.conventions import FloatArray
 
 NEAR_M = 0.02
-"""What comes nearer to the eye is left out as a whole triangle."""
+"""Least distance from the eye [m]; a nearer triangle is left out completely."""
 LARGE_MM = 250.0
 AT_ONCE = 1 << 21
-"""Places of the screen that are tested at a time: some 100 MB."""
+"""Number of places of the screen that are tested at a time: some 100 MB."""
 SMOOTH, SMALL_PX = 2, 1 << 17
-"""Computed pixels of each side of a pixel, in pictures with no more pixels: a view's own would take
-three times as long, and is soon replaced."""
+"""Computed pixels of each side of a pixel, in pictures with no more pixels: a view's
+own would take three times as long, and is soon replaced."""
 SKY, KEY = (0.62, (0.55, -0.6, 0.58))
-"""Light from everywhere, and the direction that the rest comes from."""
+"""Part of light from all sides, and the direction of the rest."""
 GROUND = {False: ((248, 250, 253), (217, 225, 236)), True: ((42, 49, 64), (15, 19, 26))}
 """Dark page or not -> colour of the background above and below, as the scenes have it."""
 Pose = tuple[float, ...]
 """Quaternion (w, x, y, z) and place [m]."""
 COARSE = (76, 60)
-"""Columns and rows of the image on the panel."""
+"""Number of columns and rows of the image on the panel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ class Shape:
     Attributes:
         corners: (n, 3, 3) [m, world], counter-clockwise from the front.
         color: (3,) or (n, 3), 0 to 255.
-        opacity: below 1 it lets through what lies behind it.
+        opacity: below 1 the background shows through.
         lit: whether its colour depends on the light.
     """
 
@@ -58,7 +58,8 @@ class Shape:
 
 
 def cut(pieces: Iterable[PaintedMesh]) -> list[Shape]:
-    """Meshes [mm] as shapes, large triangles divided: one may reach behind the eye."""
+    """Split meshes [mm] to shapes, large triangles divided: one may reach behind the
+    eye."""
     out = []
     for piece in pieces:
         mesh: Any = piece.mesh
@@ -69,19 +70,19 @@ def cut(pieces: Iterable[PaintedMesh]) -> list[Shape]:
 
 
 def shape_of(skin: Skin, opacity: float) -> Shape:
-    """A sample's mesh in its own frame, beads opaque."""
+    """Make the shape of a sample's mesh in its own frame, beads opaque."""
     corners = np.asarray(skin.vertices, dtype=float)[skin.faces]
     return Shape(corners, np.array(skin.color), 1.0 if skin.dense else opacity)
 
 
 def placed(shapes: Iterable[Shape], pose: Pose) -> list[Shape]:
-    """Shapes of a frame that stands somewhere."""
+    """Move shapes of a frame to its pose."""
     turn = Rotation.from_quat(pose[:4], scalar_first=True).as_matrix().T
     return [replace(shape, corners=shape.corners @ turn + pose[4:]) for shape in shapes]
 
 
 def image_on(rgb: npt.NDArray[np.uint8], world: World) -> Shape:
-    """The panel's image (rows, cols, 3), in front of the panel."""
+    """Make the shape of the panel's image (rows, cols, 3), in front of the panel."""
     (cols, rows), (first, right, _, down) = COARSE, world.corners - world.normal
     colors = cv2.resize(rgb, COARSE, interpolation=cv2.INTER_AREA).reshape(-1, 3)
     y, x = (part[..., None] for part in np.mgrid[: rows + 1, : cols + 1])
@@ -92,7 +93,7 @@ def image_on(rgb: npt.NDArray[np.uint8], world: World) -> Shape:
 
 
 def cone(world: World, color: tuple[int, int, int], opacity: float) -> Shape:
-    """The beam's outside, from the focal spot to the image."""
+    """Make the shape of the beam's outside, from the focal spot to the image."""
     corners = world.corners * MM
     spot = np.broadcast_to(world.source * MM, corners.shape)
     sides = np.stack([spot, np.roll(corners, -1, axis=0), corners], axis=1)
@@ -102,11 +103,12 @@ def cone(world: World, color: tuple[int, int, int], opacity: float) -> Shape:
 def drawn(
     shapes: Sequence[Shape], camera: Standpoint, size: tuple[int, int], dark: bool
 ) -> npt.NDArray[np.uint8]:
-    """The picture (height, width, 3), RGB.
+    """Draw the picture (height, width, 3), RGB.
 
     Args:
-        shapes: what is seen; the translucent ones are drawn over the others in their order.
-        camera: from where.
+        shapes: visible ones; the translucent ones are drawn over the others in their
+            order.
+        camera: of the view.
         size: (width, height) [px].
         dark: the page's background.
     """
@@ -134,7 +136,7 @@ def drawn(
 
 
 def jpeg(picture: npt.NDArray[np.uint8], most: int) -> bytes:
-    """As good a JPEG as fits into `most` bytes (or the worst)."""
+    """Encode as good a JPEG as fits into `most` bytes (or the worst)."""
     for quality in (85, 75, 60, 40):
         coded = cv2.imencode(".jpg", picture[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
         if coded.size <= most:
@@ -154,7 +156,8 @@ def _shaded(shape: Shape) -> npt.NDArray[np.float32]:
 
 
 def _projected(corners: FloatArray, camera: Standpoint, width: int, height: int) -> FloatArray:
-    """Column, row [px] and inverse depth [1/m] of corners (n, 3, 3), NaN too near the eye."""
+    """Project corners (n, 3, 3) to column, row [px] and inverse depth [1/m]; NaN too
+    near the eye."""
     eye, up = np.asarray(camera.position), np.asarray(camera.up)
     ahead = np.asarray(camera.look_at) - eye
     ahead = ahead / np.linalg.norm(ahead)
@@ -170,7 +173,17 @@ def _projected(corners: FloatArray, camera: Standpoint, width: int, height: int)
 def _filled(
     corners: FloatArray, width: int, height: int
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]:
-    """Of each pixel, row by row: the inverse depth of the nearest triangle, and which that is."""
+    """Fill the pixels with the nearest triangles.
+
+    Args:
+        corners: (n, 3, 3) column, row [px] and inverse depth [1/m].
+        width, height: of the picture [px].
+
+    Returns:
+        Of each pixel, row by row: the inverse depth of the nearest triangle, and its
+        index; 0 and -1
+        where there is none.
+    """
     low = np.floor(corners[:, :, :2].min(axis=1))
     high = np.minimum(np.ceil(corners[:, :, :2].max(axis=1)), [width, height])
     low = np.maximum(low, 0)
@@ -185,7 +198,8 @@ def _filled(
     planes = np.concatenate([edges, (part[:, :, None] * edges).sum(axis=1)[:, None]], axis=1)
     planes = planes.astype(np.float32)
     at = np.concatenate([at, (part * at).sum(axis=1)[:, None]], axis=1).astype(np.float32)
-    # Rows go downwards, so what is counter-clockwise from the front has a negative area here.
+    # Rows go downwards, so a triangle that is counter-clockwise from the front has a negative
+    # area.
     whole = np.isfinite(corners).all(axis=(1, 2)) & (high > low).all(axis=1) & (area < 0.0)
     depth = np.zeros(width * height, dtype=np.float32)
     which = np.full(width * height, -1, dtype=np.int64)

@@ -29,13 +29,13 @@ class Stills:
         stamp: tuple[object, ...],
         shapes: Callable[[], Sequence[Shape]],
     ) -> bytes:
-        """A JPEG of at most MOST_BYTES.
+        """Return a JPEG of at most MOST_BYTES, computed at its first use.
 
         Args:
-            camera: what it holds.
+            camera: of the view.
             asked: `w` and `h` [px], and `dark` where it is "1": the page's query.
-            stamp: says whether the scene is still the same.
-            shapes: makes what is seen, in a thread.
+            stamp: key of the scene's state.
+            shapes: makes the visible shapes, in a thread.
         """
         width, height = (_side(asked.get(name, "")) for name in ("w", "h"))
         dark = asked.get("dark") == "1"
@@ -52,5 +52,5 @@ class Stills:
 
 
 def _side(text: str) -> int:
-    """Pixels of a query's words."""
+    """Read the pixels of a query's words."""
     return min(MOST_PX, max(LEAST_PX, int(text[:5]) if text.isdecimal() else 0))

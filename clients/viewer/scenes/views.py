@@ -1,13 +1,15 @@
-"""Views: where each camera stands and, for the beam's eye, how the page crops it.
+"""Views: the place of each camera and, for the beam's eye, how the page crops it.
 
-Every view but the beam's eye holds tube, sample and image whatever their distances, as large as
-a pane of its width and height allows (`Fitted`); the sample's own picture beside it is made in the
-same way. Source and detector are metres apart and a sample is centimetres high, so in none of them
-can the sample itself be large: the page shows it close up in each pane.
+Every view but the beam's eye holds tube, sample and image whatever their distances, as
+large as a pane of its width and height allows (`Fitted`); the sample's own picture next
+to it is made in the same way. Source and detector are metres apart and a sample is
+centimetres high, so in none of them can the sample itself be large: the page shows it
+close up in each pane.
 
-The beam's eye stands in the focal spot and looks along the detector's normal, so the panel is an
-undistorted rectangle. Where the piercing point is off its centre the picture is rendered larger and
-cropped by the page, since a browser's camera is symmetric. Units: m for viser, ratios for the page.
+The beam's eye is in the focal spot and looks along the detector's normal, so the panel is
+an undistorted rectangle. Where the piercing point is off its centre the picture is
+rendered larger and cropped by the page, since a browser's camera is symmetric. Units: m
+for viser, ratios for the page.
 """
 
 from __future__ import annotations
@@ -25,21 +27,22 @@ from flexdt.twin.geometry.conventions import FloatArray
 
 Vector = tuple[float, float, float]
 WIDEST = 3.0
-"""The beam's eye is rendered at most this many times as wide or high as the panel; beyond, the
-camera looks at the panel's centre instead and the frame is no longer exact."""
+"""Largest width or height of the beam's eye, over the panel's; beyond, the camera
+looks at the panel's centre instead and the frame is no longer exact."""
 WIDE = 1.35
-"""Aspect (width over height) of a pane of which nothing is known yet."""
+"""Aspect (width over height) of a pane whose size is not known yet."""
 NARROWEST, BROADEST = 0.3, 4.0
-"""Aspects for which cameras are made."""
+"""Range of aspects for which cameras are made."""
 ROOM = 0.9
-"""Part of the picture, in width and height, that what is fitted takes."""
+"""Part of the picture, in width and height, that fitted points take."""
 TUBE_MM = (110.0, 110.0, 100.0)
-"""Of the tube around and behind its focal spot that views show: width, length, height."""
+"""Size of the tube around and behind its focal spot in views: width, length, height
+[mm]."""
 RIM_CORNERS: Final = 12
-"""Of the polygon around the cylinder in which a sample turns."""
+"""Number of corners of the polygon around the cylinder in which a sample turns."""
 FOV_RAD: Final = {"iso": math.radians(30.0), "side": math.radians(24.0),
                   "free": math.radians(34.0), "sample": math.radians(30.0)}  # fmt: skip
-"""View -> vertical opening of its camera."""
+"""View -> vertical opening of its camera [rad]."""
 
 
 def _way(yaw_deg: float, pitch_deg: float) -> Vector:
@@ -73,18 +76,18 @@ class Standpoint:
 
 
 FREE = Standpoint((-0.95, 0.1, 0.52), (0.0, 0.72, 0.0), (0.0, 0.0, 1.0), math.radians(45.0))
-"""Of exported scenes of which nobody has looked at one."""
+"""Camera of exported scenes for which no person has chosen one."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """What a view holds, and from where it may be looked at.
+    """Points of a view, and the directions from which it may be seen.
 
     Attributes:
         points: (n, 3) [m], all of which are in the picture.
         ways: directions of the look.
         fov: vertical opening [rad].
-        around: (3,) [m], what turns of the camera keep at their distance.
+        around: (3,) [m], centre of the camera's turns.
     """
 
     points: FloatArray
@@ -93,7 +96,8 @@ class Fitted:
     around: FloatArray
 
     def at(self, aspect: float) -> Standpoint:
-        """The camera for a pane: of those that hold all points, the one nearest to the middle.
+        """Choose the camera for a pane: of those that hold all points, the one nearest to
+        the middle.
 
         Args:
             aspect: the pane's width over its height.
@@ -102,10 +106,10 @@ class Fitted:
         return min(cameras, key=lambda one: float(np.linalg.norm(self.around - one.position)))
 
     def fits(self, camera: Standpoint, aspect: float) -> bool:
-        """Whether a camera holds all points and wastes no room.
+        """Check that a camera holds all points and wastes no room.
 
         Args:
-            camera: where it stands now.
+            camera: its present place.
             aspect: the pane's width over its height.
         """
         eye = np.asarray(camera.position)
@@ -122,11 +126,11 @@ class Fitted:
 
 
 LEAST_REACH: Final = 0.75
-"""Part of the picture below which what a view holds has become too small."""
+"""Part of the picture below which a view's points have become too small."""
 
 
 def bounded(aspect: float) -> float:
-    """An aspect for which cameras are made."""
+    """Cut an aspect to the range for which cameras are made."""
     return min(BROADEST, max(NARROWEST, aspect))
 
 
@@ -156,10 +160,11 @@ def presets(world: World, radius_mm: float, rim_mm: FloatArray | None = None) ->
 
 
 def rim(world: World, vertices_m: Sequence[npt.NDArray[np.float32]]) -> FloatArray | None:
-    """Points (n, 3) [mm] around the cylinder in which the sample turns; None without a sample.
+    """Compute points (n, 3) [mm] around the cylinder in which the sample turns; None
+    without a sample.
 
     Args:
-        world: how the sample stands.
+        world: pose of the sample.
         vertices_m: of its meshes, in its own frame.
     """
     if not any(len(some) for some in vertices_m):
@@ -178,7 +183,8 @@ def rim(world: World, vertices_m: Sequence[npt.NDArray[np.float32]]) -> FloatArr
 
 
 def _axes(ahead: FloatArray) -> FloatArray:
-    """Right, up and ahead of a camera as rows (3, 3); the world's z is upwards."""
+    """Compute right, up and ahead of a camera as rows (3, 3); the world's z is
+    upwards."""
     right = np.cross(ahead, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(right, ahead), ahead])
@@ -187,13 +193,13 @@ def _axes(ahead: FloatArray) -> FloatArray:
 def fitted(
     points: FloatArray, way: Vector, fov: float, around: FloatArray, aspect: float = WIDE
 ) -> Standpoint:
-    """The nearest camera that looks along `way` and holds all points; up is +z.
+    """Find the nearest camera that looks along `way` and holds all points; up is +z.
 
     Args:
         points: (n, 3) [m].
         way: direction of the look.
         fov: vertical opening [rad].
-        around: (3,) [m], what turns of the camera keep at their distance.
+        around: (3,) [m], centre of the camera's turns.
         aspect: the pane's width over its height.
     """
     ahead = np.asarray(way) / np.linalg.norm(way)
@@ -214,11 +220,19 @@ def fitted(
 
 
 def beam_view(world: World) -> tuple[Standpoint, dict[str, object]]:
-    """The beam's eye of a geometry, and how a page crops it to show the image and nothing else.
+    """Compute the beam's eye of a geometry, and how a page crops it to the image alone.
 
-    Lengths for the page are in units of the image's width: the picture is `width` x `height`, and
-    the image, 1 x `aspect`, has its top left corner `left`, `top` inside it; the sample stands
-    `sample_height_mm` above the focal spot. Where not `exact` the eye looks at the panel's middle.
+    Args:
+        world: geometry.
+
+    Returns:
+        Camera and framing. Lengths are in units of the image's width: the picture is
+        `width` x
+        `height`, and the image, 1 x `aspect`, has its top left corner `left`, `top`
+        inside it; the
+        sample is `sample_height_mm` above the focal spot. Where not `exact` the eye looks
+        at the
+        panel's middle.
     """
     rows, cols = world.shape
     pu, pv = float(np.linalg.norm(world.u)), float(np.linalg.norm(world.v))

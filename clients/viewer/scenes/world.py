@@ -45,7 +45,7 @@ class World:
         axis: point of the rotation axis at the sample's reference height (3,) [mm].
         stage: from the object's frame to the world.
         sample: from the sample's own frame to the world.
-        tube_shift, panel_shift: what the correction adds to source and detector (3,) [mm].
+        tube_shift, panel_shift: shift of source and detector by the correction (3,) [mm].
     """
 
     view: ConeVec
@@ -90,7 +90,7 @@ class World:
         return self.view.piercing_points().reshape(2)
 
     def pixel(self, column: float, row: float) -> FloatArray:
-        """Centre of a pixel (3,) [mm]."""
+        """Compute the centre of a pixel (3,) [mm]."""
         rows, cols = self.shape
         across, down = column - (cols - 1) / 2, row - (rows - 1) / 2
         return np.asarray(self.detector + across * self.u + down * self.v)
@@ -104,7 +104,7 @@ class World:
 
 
 def camera_of(machine: Machine, camera: CameraState) -> CameraSettings:
-    """The twin's camera settings of the wire's."""
+    """Convert the wire's camera settings to the twin's."""
     return CameraSettings(
         camera.mode, Roi(*camera.roi), camera.exposure_ms, camera.averages, camera.frames,
         machine.detector.camera.modes,
@@ -112,18 +112,18 @@ def camera_of(machine: Machine, camera: CameraState) -> CameraSettings:
 
 
 def parameters_of(state: State) -> Offsets:
-    """The correction in force, or none."""
+    """Return the correction in force, or none."""
     correction = state.correction
     return NOMINAL if correction is None else Offsets.from_edge(correction.parameters)
 
 
 def motors(machine: Machine, state: State) -> dict[str, float]:
-    """Motor -> position, without virtual axes."""
+    """Return motor -> position, without virtual axes."""
     return {n: a.position for n, a in state.axes.items() if n in machine.axes}
 
 
 def world_of(machine: Machine, profile: Profile, state: State) -> World:
-    """Where everything is.
+    """Compute the geometry of a state.
 
     Args:
         machine, profile: the twin's.
@@ -142,11 +142,11 @@ def placed(
     p: Offsets = NOMINAL,
     offset: StagePlacement | None = None,
 ) -> World:
-    """Where everything is.
+    """Compute the geometry for motor positions.
 
     Args:
         machine, profile: the twin's.
-        camera: says the image's pixels.
+        camera: with the image's pixels.
         positions: motor -> position [mm, deg].
         p: the correction in force.
         offset: of the sample on the stage; None is none.
@@ -167,7 +167,7 @@ def placed(
 
 
 def quaternion(rotation: FloatArray) -> tuple[float, float, float, float]:
-    """Rotation (3, 3) as (w, x, y, z)."""
+    """Convert a rotation (3, 3) to (w, x, y, z)."""
     x, y, z, w = Rotation.from_matrix(rotation).as_quat().tolist()
     return (w, x, y, z)
 
@@ -175,12 +175,12 @@ def quaternion(rotation: FloatArray) -> tuple[float, float, float, float]:
 def beads_on(
     cone_vec: Sequence[float], beads: FloatArray, world: World, shape: tuple[int, ...]
 ) -> list[list[float]]:
-    """Where bead centres appear in an image of geometry `cone_vec` (object's frame).
+    """Project bead centres into an image of geometry `cone_vec` (object's frame).
 
     Args:
         cone_vec: twelve numbers, with the correction in force.
         beads: (k, 3) [mm], the sample's own frame.
-        world: says how the sample stands on the stage.
+        world: pose of the sample on the stage.
         shape: (rows, cols) of the image.
 
     Returns:

@@ -1,8 +1,9 @@
 """The lead cabinet around the machine, as painted meshes (mm).
 
-It is drawn only; no collision knows of it. Its walls are seen from the inside alone, so whatever
-stands between a camera and the machine is cut away. A kerb shows where they go; the wall opposite
-the operator has the door, with a window of lead glass and the lamp that says whether X-rays are on.
+It is drawn only; collisions ignore it. Its walls are seen from the inside alone, so those
+between a camera and the machine are cut away. A kerb shows their place; the wall opposite
+the operator has the door, with a window of lead glass and the lamp that shows whether
+X-rays are on.
 """
 
 from __future__ import annotations
@@ -20,15 +21,16 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.description import Component, Machine, profile_of
 
 DRAWN_FOR_MM: Final = (2000.0, 1390.0)
-"""What the FleX-ray's parts reach sideways and upwards, for which all lengths below hold; those of
-another machine are in proportion, by the smaller."""
+"""Reach of the FleX-ray's parts sideways and upwards, for which all lengths below hold
+[mm]; those of another machine are in proportion, by the smaller."""
 ROOM_MM: Final = (150.0, 150.0, 350.0)
-"""Between whatever the machine's parts reach and the walls; above it, what lamps need and more."""
+"""Distance of the walls from all that the machine's parts reach; above it, room for
+lamps [mm]."""
 BELOW_MM: Final = 45.0
-"""From the lowest part to the floor."""
+"""Distance from the lowest part to the floor [mm]."""
 DOOR_MM: Final = (900.0, 1050.0)
 EDGE_MM: Final = 2.0
-"""Cut off the edges of blocks."""
+"""Width cut off the edges of blocks [mm]."""
 WALL = Paint((208, 213, 220), 0.0, 0.9)
 FLOOR = Paint((120, 127, 138), 0.0, 0.95)
 DOOR = Paint((232, 236, 241), 0.0, 0.7)
@@ -38,16 +40,16 @@ LAMP = {False: (92, 98, 106), True: (255, 243, 196)}
 
 
 def ground_of(machine: Machine) -> Component:
-    """The part on which the others stand."""
+    """Find the part that carries the others."""
     return max(machine.components, key=lambda part: part.size_mm[0] * part.size_mm[1])
 
 
 class Room(NamedTuple):
-    """Where a machine stands.
+    """Space of a machine.
 
     Attributes:
         low, high: corners of all that its parts reach, (3,) [mm].
-        scale: how large it is beside the FleX-ray.
+        scale: its size over that of the FleX-ray.
         floor_mm: height of the floor.
     """
 
@@ -58,7 +60,7 @@ class Room(NamedTuple):
 
 
 def room_of(machine: Machine) -> Room:
-    """The room that a machine needs."""
+    """Compute the room that a machine needs."""
     low, high = reach_of(machine)
     across, tall = (high - low)[:2].max(), (high - low)[2]
     scale = float(min(across / DRAWN_FOR_MM[0], tall / DRAWN_FOR_MM[1]))
@@ -66,8 +68,14 @@ def room_of(machine: Machine) -> Room:
 
 
 def reach_of(machine: Machine) -> tuple[FloatArray, FloatArray]:
-    """Lowest and highest corner of all that the machine's parts, as they are drawn, reach over
-    their travel, (3,)."""
+    """Compute the box of all that the machine's drawn parts reach over their travel.
+
+    Args:
+        machine: with axes and components.
+
+    Returns:
+        Lowest and highest corner (3,) [mm].
+    """
     limits = np.array([(axis.lower, axis.upper) for axis in machine.axes.values()])
     bodies = {body.name: body for body in stage_bodies(machine, profile_of(machine))}
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -84,8 +92,14 @@ def reach_of(machine: Machine) -> tuple[FloatArray, FloatArray]:
 
 
 def cabinet(room: Room) -> tuple[list[PaintedMesh], FloatArray]:
-    """The cabinet's pieces, and where its lamp is, (3,); it stands around all that the machine's
-    parts reach."""
+    """Build the cabinet around all that the machine's parts reach.
+
+    Args:
+        room: of the machine.
+
+    Returns:
+        Pieces, and the place of its lamp (3,) [mm].
+    """
     s = room.scale
     low, high = room.low - s * np.array(ROOM_MM), room.high + s * np.array(ROOM_MM)
     low[2] = room.floor_mm

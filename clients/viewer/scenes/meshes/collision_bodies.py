@@ -11,11 +11,12 @@ from flexdt.twin.collision.convex_solids import ConvexSolid, Polytope, UprightCy
 from flexdt.twin.geometry.conventions import FloatArray
 
 FINENESS = 2
-"""Of the ball that a body is grown by: an icosphere, whose points lie along the axes too."""
+"""Subdivisions of the ball that a body is grown by: an icosphere, with points along
+the axes too."""
 
 
 def bare(solid: ConvexSolid) -> trimesh.Trimesh:
-    """A convex solid [mm]."""
+    """Build a convex solid [mm]."""
     if isinstance(solid, UprightCylinder):
         size = 2.0 * solid.radius, solid.height
         return cylinder(*size, solid.center, STEEL).mesh
@@ -24,7 +25,7 @@ def bare(solid: ConvexSolid) -> trimesh.Trimesh:
 
 
 def grown(body: trimesh.Trimesh, margin_mm: float) -> trimesh.Trimesh:
-    """A convex body and everything within `margin_mm` of it."""
+    """Build a convex body with everything within `margin_mm` of it."""
     ball = trimesh.creation.icosphere(subdivisions=FINENESS, radius=margin_mm).vertices
     corners = np.asarray(body.vertices)[:, None, :] + np.asarray(ball)[None, :, :]
     return _hull(corners.reshape(-1, 3))

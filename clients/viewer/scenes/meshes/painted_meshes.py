@@ -16,7 +16,7 @@ from flexdt.clients.viewer.scenes.world import MM
 from flexdt.twin.geometry.conventions import FloatArray, rotation_about
 
 SMOOTH_RAD: Final = 0.6
-"""Edges sharper than this stay sharp when shaded."""
+"""Angle of edges that stay sharp when shaded [rad]."""
 
 Vector = Sequence[float]
 
@@ -40,7 +40,7 @@ class PaintedMesh:
 
 
 def bevelled(size: Vector, center: Vector, paint: Paint, bevel: float = 2.0) -> PaintedMesh:
-    """A box [mm] whose edges are cut, so that they catch the light."""
+    """Build a box [mm] whose edges are cut, so that they catch the light."""
     h = np.asarray(size, dtype=float) / 2.0
     b = min(bevel, 0.35 * float(h.min()))
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
@@ -60,7 +60,7 @@ def cylinder(
     axis: str = "z",
     sections: int = 48,
 ) -> PaintedMesh:
-    """A cylinder [mm] along z (or y)."""
+    """Build a cylinder [mm] along z (or y)."""
     mesh = trimesh.creation.cylinder(radius=diameter / 2, height=height, sections=sections)
     return _standing(mesh, center, paint, axis)
 
@@ -68,13 +68,14 @@ def cylinder(
 def lathe(
     profile: Sequence[tuple[float, float]], center: Vector, paint: Paint, axis: str = "z"
 ) -> PaintedMesh:
-    """A body of revolution [mm]: (radius, height) from bottom to top, about z (or y)."""
+    """Build a body of revolution [mm]: (radius, height) from bottom to top, about z
+    (or y)."""
     mesh = trimesh.creation.revolve(np.asarray(profile, dtype=float), sections=64)
     return _standing(mesh, center, paint, axis)
 
 
 def _standing(mesh: trimesh.Trimesh, center: Vector, paint: Paint, axis: str) -> PaintedMesh:
-    """What was made about z, about z or y."""
+    """Move a mesh made about z to its place, turned to y if so wanted, and paint it."""
     if axis == "y":
         mesh.apply_transform(turn_matrix((1, 0, 0), -np.pi / 2))
     mesh.apply_translation(center)
@@ -82,7 +83,8 @@ def _standing(mesh: trimesh.Trimesh, center: Vector, paint: Paint, axis: str) ->
 
 
 def glb(pieces: Iterable[PaintedMesh]) -> bytes:
-    """One binary glTF of the pieces, in metres; pieces of one paint share a mesh."""
+    """Write one binary glTF of the pieces, in metres; pieces of one paint share a
+    mesh."""
     groups: dict[Paint, list[trimesh.Trimesh]] = {}
     for piece in pieces:
         groups.setdefault(piece.paint, []).append(piece.mesh)
@@ -96,6 +98,12 @@ def glb(pieces: Iterable[PaintedMesh]) -> bytes:
 
 
 def _painted(meshes: Sequence[trimesh.Trimesh], paint: Paint) -> trimesh.Trimesh:
+    """Join meshes [mm] of one paint to one mesh [m], smooth but for sharp edges.
+
+    Args:
+        meshes: of one paint.
+        paint: colour, metal, roughness and glow.
+    """
     shaded = [trimesh.graph.smooth_shade(m, angle=SMOOTH_RAD) for m in meshes]
     mesh: Any = trimesh.util.concatenate(shaded)
     mesh.apply_scale(MM)
@@ -114,20 +122,20 @@ def _painted(meshes: Sequence[trimesh.Trimesh], paint: Paint) -> trimesh.Trimesh
 
 
 def _linear(channel: int) -> float:
-    """A channel of sRGB as glTF wants it: linear, 0 to 1."""
+    """Convert a channel of sRGB to glTF's: linear, 0 to 1."""
     c = channel / 255.0
     return c / 12.92 if c <= 0.04045 else float(((c + 0.055) / 1.055) ** 2.4)
 
 
 def turn_matrix(axis: Vector, angle: float) -> FloatArray:
-    """A right-handed turn about an axis through the origin, (4, 4)."""
+    """Make a right-handed turn about an axis through the origin, (4, 4)."""
     out = np.eye(4)
     out[:3, :3] = rotation_about(axis, angle)
     return out
 
 
 def plain(mesh: trimesh.Trimesh) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
-    """Vertices [m] and faces of a mesh in mm."""
+    """Convert a mesh in mm to vertices [m] and faces."""
     return (
         (np.asarray(mesh.vertices) * MM).astype(np.float32),
         np.asarray(mesh.faces, dtype=np.uint32),

@@ -16,4 +16,4 @@ BRASS = Paint((206, 168, 92), 0.3, 0.35)
 SIGNAL = Paint((255, 140, 0), 0.0, 0.5, (0.25, 0.12, 0.0))
 RUBBER = Paint((34, 37, 43), 0.0, 0.8)
 PAINTS: Final = {name: value for name, value in globals().items() if isinstance(value, Paint)}
-"""By their names in `data/parts.toml`."""
+"""Paints by their names in `data/parts.toml`."""

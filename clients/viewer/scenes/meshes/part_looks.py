@@ -1,9 +1,9 @@
-"""The scanner's components as painted meshes: recognisable machine parts, from the machine file's
-boxes alone (mm).
+"""The scanner's components as painted meshes: recognisable machine parts, from the
+machine file's boxes alone (mm).
 
-`data/parts.toml` says of which pieces a look consists. Components of other names and roles become
-bevelled boxes or cylinders, so another machine file still draws; a part with a mesh of its own is
-drawn as that.
+`data/parts.toml` has the pieces of each look. Components of other names and roles become
+bevelled boxes or cylinders, so another machine file still draws; a part with a mesh of
+its own is drawn as that.
 """
 
 from __future__ import annotations
@@ -36,11 +36,14 @@ LOOKS: Final[Mapping[str, Any]] = tomllib.loads(_TABLE.read_text(encoding="utf-8
 
 
 def own_looks(machine: Machine, folder: Path) -> dict[str, bytes]:
-    """Part -> its own mesh as a GLB file [m], for those that have one.
+    """Read the parts' own meshes as GLB files [m].
 
     Args:
-        machine: whose parts.
-        folder: of its machine file, in which the meshes lie.
+        machine: with the parts.
+        folder: of its machine file and the meshes.
+
+    Returns:
+        Part -> GLB file, for those that have a mesh.
 
     Raises:
         PhantomError: a file cannot be read any more.
@@ -57,7 +60,7 @@ def own_looks(machine: Machine, folder: Path) -> dict[str, bytes]:
 
 
 def pieces_of(part: Component) -> list[PaintedMesh]:
-    """The part's painted meshes, in its own frame [mm]."""
+    """Build the part's painted meshes, in its own frame [mm]."""
     if part.points_mm:
         return [PaintedMesh(trimesh.convex.convex_hull(np.array(part.points_mm)), ALUMINIUM)]
     role = part.role if part.role in LOOKS["looks"] else part.shape
@@ -69,7 +72,12 @@ def pieces_of(part: Component) -> list[PaintedMesh]:
 
 
 def _pieces(piece: Mapping[str, Any], sides: FloatArray) -> list[PaintedMesh]:
-    """One piece of a look, as often as it is turned; about the middle of a box of these sides."""
+    """Build one piece of a look, once for each of its turns, about the middle of a box.
+
+    Args:
+        piece: of `data/parts.toml`.
+        sides: of the box (3,) [mm].
+    """
     size, place = (
         (sides * piece.get(share, MIDDLE) + piece.get(more, MIDDLE)).tolist()
         for share, more in (("share", "mm"), ("at", "at_mm"))
