@@ -1,8 +1,10 @@
-"""The surface of what is dense in a volume, as a closed mesh that the scenes draw on the stage.
+"""The surface of dense parts of a volume, as a closed mesh that the scenes draw on the
+stage.
 
-Dense is what lies above Otsu's threshold. The mesh is a surface net: a vertex in each cell whose
-corners lie on both sides, at the mean of the crossings of its edges, and four neighbouring cells
-joined around each edge that crosses (S. Gibson, Constrained elastic surface nets, 1998).
+Voxels above Otsu's threshold are dense. The mesh is a surface net: a vertex in each cell
+with corners on both sides, at the mean of the crossings of its edges, and four
+neighbouring cells joined around each edge that crosses (S. Gibson, Constrained elastic
+surface nets, 1998).
 """
 
 from __future__ import annotations
@@ -18,11 +20,11 @@ import numpy.typing as npt
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 GROWING_CELLS: Final = 64
-"""Cells along the longest side of the grid while a scan runs."""
+"""Number of cells along the longest side of the grid while a scan runs."""
 FINISHED_CELLS: Final = 110
-"""Cells along the longest side of the grid once it has ended."""
+"""Number of cells along the longest side of the grid once it has ended."""
 MOST_FACES: Final = 90_000
-"""Triangles of a surface; a grid with more is taken coarser."""
+"""Largest number of triangles of a surface; a grid with more is made coarser."""
 OTSU_BINS: Final = 256
 Faces = npt.NDArray[np.int32]
 _EDGES: Final = tuple(
@@ -60,14 +62,15 @@ def otsu(values: npt.NDArray[np.generic]) -> float:
 
 
 def net(data: FloatArray | Float32Array, level: float) -> tuple[FloatArray, Faces]:
-    """Find the surface of what lies above a level.
+    """Find the surface of the part above a level.
 
     Args:
         data: on a grid of points, none of those at its border above the level.
         level: in the unit of `data`.
 
     Returns:
-        Vertices (v, 3) in steps of the grid from its first point, and faces (f, 3), outward.
+        Vertices (v, 3) in steps of the grid from its first point, and faces (f, 3),
+        outward.
     """
     dense = data > level
     corners = [
@@ -89,7 +92,7 @@ def net(data: FloatArray | Float32Array, level: float) -> tuple[FloatArray, Face
 
 
 def _quads(dense: npt.NDArray[np.bool_], number: npt.NDArray[np.int32]) -> Faces:
-    """Two triangles around each edge that crosses the surface."""
+    """Make two triangles around each edge that crosses the surface."""
     faces = []
     for axis in range(3):
         u, v = (np.eye(3, dtype=int)[(axis + k) % 3] for k in (1, 2))
@@ -106,15 +109,16 @@ def _quads(dense: npt.NDArray[np.bool_], number: npt.NDArray[np.int32]) -> Faces
 def surface(
     grown: Float32Array, voxel_mm: Any, center_mm: Any, cells: int = GROWING_CELLS
 ) -> dict[str, Any]:
-    """Find the surface of what is dense, for the scenes.
+    """Find the surface of the dense parts, for the scenes.
 
     Args:
         grown: (y, x, z) [1/mm]; not a number where no data cover.
         voxel_mm, center_mm: of the volume (x, y, z), as `Volume` has them.
-        cells: along the longest side of the grid on which it is looked for.
+        cells: along the longest side of the search grid.
 
     Returns:
-        `vertices` (v, 3) float32 [mm, object frame] and `faces` (f, 3) int32, both base64; empty
+        `vertices` (v, 3) float32 [mm, object frame] and `faces` (f, 3) int32, both
+        base64; empty
         where nothing is dense.
     """
     factor = max(1, -(-max(grown.shape) // cells))
@@ -133,7 +137,7 @@ def surface(
 
 
 def _means(grown: Float32Array, shape: list[int], factor: int) -> Float32Array:
-    """Means over cubes of voxels."""
+    """Compute means over cubes of voxels."""
     cut = grown[tuple(slice(n * factor) for n in shape)]
     blocks = [part for n in shape for part in (n, factor)]
     return np.asarray(cut.reshape(blocks).mean(axis=(1, 3, 5)), dtype=np.float32)
@@ -144,7 +148,7 @@ def _text(array: npt.NDArray[np.generic]) -> str:
 
 
 def mesh_of(told: Mapping[str, Any]) -> tuple[FloatArray, Faces]:
-    """Vertices (v, 3) [mm, object frame] and faces (f, 3) of a `surface`."""
+    """Decode vertices (v, 3) [mm, object frame] and faces (f, 3) of a `surface`."""
     vertices = np.frombuffer(base64.b64decode(told["vertices"]), "<f4").reshape(-1, 3)
     faces = np.frombuffer(base64.b64decode(told["faces"]), "<i4").reshape(-1, 3)
     return vertices.astype(np.float64), faces.astype(np.int32)

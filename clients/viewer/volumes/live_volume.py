@@ -1,24 +1,25 @@
-"""A volume that grows while its scan runs, and those of past scans: FDK in a process of its own.
+"""A volume that grows while its scan runs, and those of past scans: FDK in a process of
+its own.
 
-`python -m flexdt.clients.viewer.volumes.live_volume` loads what it needs and reads a line, FOLDER,
-SIDE and perhaps `past`, tabs between them. It follows that data set then and prints a line of JSON
-whenever its volume has changed: views so far and of how many, its size, and now and then the
-surface of what is dense, for the scenes. The geometry of all images is written when a scan begins,
-so each view has its final weight at once, and the values of a grown volume are those of the
-finished one.
+`python -m flexdt.clients.viewer.volumes.live_volume` loads its libraries and reads a
+line, FOLDER, SIDE and perhaps `past`, tabs between them. It follows that data set then
+and prints a line of JSON whenever its volume has changed: views so far and of how many,
+its size, and now and then the surface of its dense parts, for the scenes. The geometry of
+all images is written when a scan begins, so each view has its final weight at once, and
+the values of a grown volume are those of the finished one.
 
-With `past` it is the volume of `flexdt reconstruct` from the images that are there.
+With `past` it is the volume of `flexdt reconstruct` from the images at hand.
 
-Further lines ask for more: `block NAME` for a volume as a page draws it, `voxel X Y Z` for exact
-values, `compare` with the correction that is in force now for the volume beside the truth of its
-sample, with a correction and without.
+Further lines are requests: `block NAME` for a volume as a page draws it, `voxel X Y Z`
+for exact values, `compare` with the present correction to compare the volume with the
+truth of its sample, with a correction and without.
 
-The process has a low priority, beside a scan one thread, and ends with its viewer: neither twin nor
-viewer waits for it.
+The process has a low priority, during a scan one thread, and ends with its viewer:
+neither twin nor viewer waits for it.
 
-A page draws a volume from 16-bit codes of voxels, or of means over cubes of them. It gets them
-once, and then scrolls, windows and turns it without asking; single voxels it asks for by `exact`,
-because codes are rounded.
+A page draws a volume from 16-bit codes of voxels, or of means over cubes of them. It gets
+them once, and then scrolls, windows and turns it without requests; single voxels it
+requests by `exact`, because codes are rounded.
 """
 
 from __future__ import annotations
@@ -56,28 +57,30 @@ from flexdt.twin.reconstruction.feldkamp.fdk import fdk_parts
 from flexdt.twin.scanner.state import NamedCorrection
 
 MOST_VOXELS: Final = 14 << 20
-"""Of a finished volume: 28 MB, and 239 x 239 x 190 voxels of the usual camera mode as they are."""
+"""Largest number of voxels of a finished volume for a page: 28 MB, and 239 x 239 x 190
+voxels of the usual camera mode at full resolution."""
 MOST_GROWING: Final = 3 << 20
-"""Of one that comes anew every second: 6 MB."""
+"""Largest number of voxels of a volume that is sent every second: 6 MB."""
 TOP: Final = 65534
 """Codes are 1 + 0..TOP between the least and the greatest value; 0 is a voxel without data."""
 DARKEST: Final = 0.3
-"""Streaks below air count up to this part of what is bright, so that air is dark."""
+"""Lower end of the window, as a part of the bright values: streaks below air stay
+dark."""
 SAMPLES: Final = 200_000
-"""Voxels from which the window is chosen."""
+"""Number of voxels from which the window is chosen."""
 MOST_VIEWS: Final = 360
-"""Of a longer scan every n-th image is taken."""
+"""Largest number of views; of a longer scan every n-th image is taken."""
 LOOK_S: Final = 0.1
 TELL_S: Final = 0.4
-"""Between two lines, at least."""
+"""Least interval between two lines [s]."""
 SURFACE_S: Final = 1.2
-"""Between two surfaces for the scenes, at least."""
+"""Least interval between two surfaces for the scenes [s]."""
 
 Tell = Callable[[dict[str, Any]], None]
 
 
 def block(data: Float32Array, most: int = MOST_VOXELS) -> tuple[dict[str, Any], bytes]:
-    """A volume for a page.
+    """Encode a volume for a page.
 
     Args:
         data: (z, y, x) [1/mm]; not a number where no data cover.
@@ -99,7 +102,7 @@ def block(data: Float32Array, most: int = MOST_VOXELS) -> tuple[dict[str, Any], 
     there = np.isfinite(cubes)
     low, high = (float(f(cubes, initial=0.0, where=there)) for f in (np.min, np.max))
     high = max(high, low + 1e-9)
-    with np.errstate(invalid="ignore"):  # what is no number becomes 0 below
+    with np.errstate(invalid="ignore"):  # not a number becomes 0 below
         codes = ((cubes - low) * (TOP / (high - low)) + 1.5).astype("<u2")
     codes[~there] = 0
     some = cubes.reshape(-1)[:: max(1, cubes.size // SAMPLES)]
@@ -113,7 +116,8 @@ def block(data: Float32Array, most: int = MOST_VOXELS) -> tuple[dict[str, Any], 
 
 
 def exact(data: Float32Array, place: tuple[int, int, int]) -> float | None:
-    """The value of the voxel (x, y, z) [1/mm]; None where no data cover, or beside the volume."""
+    """Read the value of the voxel (x, y, z) [1/mm]; None where no data cover, or
+    outside the volume."""
     x, y, z = place
     if not all(0 <= at < n for at, n in zip((z, y, x), data.shape, strict=True)):
         return None
@@ -123,11 +127,11 @@ def exact(data: Float32Array, place: tuple[int, int, int]) -> float | None:
 
 @dataclass
 class Held:
-    """The volumes of the process by name, (z, y, x), and what it says of them.
+    """The volumes of the process by name, (z, y, x), and its facts about them.
 
-    `volume` is the one that was asked for, `sigma` and `bias_bound` its noise and what else it may
-    be off by, `truth` its sample's and `other` the one with the other geometry, once they have been
-    compared.
+    `volume` is the requested one, `sigma` and `bias_bound` its noise and a bound of its
+    other errors, `truth` its sample's and `other` the one with the other geometry, once
+    they have been compared.
     """
 
     tell: Tell
@@ -142,24 +146,24 @@ class Held:
         self.tell({"type": "volume", **self.about, **more})
 
     def keep(self, **more: Any) -> None:
-        """As `say`; `more` stays true."""
+        """Store `more` facts for all later lines and print them, as `say`."""
         self.about |= more
         self.say()
 
     def hold(self, data: Float32Array, grid: Volume) -> None:
-        """A volume to be asked for."""
+        """Store a volume for requests."""
         self.grid, self.volumes = grid, {"volume": data}
         self.about |= {"size": list(data.shape[::-1]), "voxel_mm": float(np.max(grid.voxel_mm))}
 
 
 def grow(held: Held, folder: Path, side: int, alive: Callable[[], bool] = lambda: True) -> None:
-    """Reconstruct a data set while it comes into being.
+    """Reconstruct a data set while it is taken.
 
     Args:
-        held: gets the volume, which is there before the first image.
+        held: gets the volume, which exists before the first image.
         folder: of the data set.
         side: voxels along x and y, about; along z as many as the panel's height gives.
-        alive: whether somebody still waits.
+        alive: whether the viewer still waits.
 
     Raises:
         TwinError: no circular scan, or images that cannot be read.
@@ -199,15 +203,16 @@ def grow(held: Held, folder: Path, side: int, alive: Callable[[], bool] = lambda
         held.say(views=views, of=len(indices), **more)
 
     volume = fdk_parts(parts, cone_vec, shape, like, progress=progress, target=target)
-    held.hold(volume.data, like)  # what no view has covered is no number now
+    held.hold(volume.data, like)  # voxels without any view are not a number now
     held.keep(done=1.0, views=len(indices), of=len(indices))
 
 
 def reconstruct(held: Held, folder: Path, side: int) -> None:
-    """The volume of a past scan, as `flexdt reconstruct` makes it of binned images.
+    """Reconstruct the volume of a past scan, as `flexdt reconstruct` does from binned
+    images.
 
     Args:
-        held: gets the volume, and tells the progress.
+        held: gets the volume and the progress.
         folder: of the data set.
         side: columns to which images are binned, about.
 
@@ -220,7 +225,7 @@ def reconstruct(held: Held, folder: Path, side: int) -> None:
         warnings.simplefilter("always")
         volume = reconstruct_volume(data, held.request, progress=_share(held, "done"), errors=True)
     said, accuracy = [str(doubt.message) for doubt in doubts], volume.accuracy
-    if accuracy is not None and not accuracy.warnings:  # which say it, too
+    if accuracy is not None and not accuracy.warnings:  # the accuracy has the same warnings
         said.append(str(accuracy))
     held.hold(volume.data, volume)
     held.keep(
@@ -250,7 +255,11 @@ def _named(correction: NamedCorrection | None) -> str:
 
 
 def _facts(data: DataSet) -> dict[str, Any]:
-    """What a person wants to read beside a volume; where nobody has said it: nothing."""
+    """Collect a data set's facts for people; unknown ones are empty.
+
+    Returns:
+        `sample`, `started` and `kV`.
+    """
     settings, document = data.settings, data.document
     return {
         "sample": "" if document is None else document.sample.name,
@@ -260,10 +269,12 @@ def _facts(data: DataSet) -> dict[str, Any]:
 
 
 def compare(held: Held, now: NamedCorrection | None) -> None:
-    """A past scan's volume beside the truth of its sample, with a correction and without.
+    """Compare a past scan's volume with the truth of its sample, with a correction and
+    without.
 
     Args:
-        held: gets the volumes `truth` and, where there is a correction, `other`; tells the figures.
+        held: gets the volumes `truth` and, where there is a correction, `other`; prints
+            the figures.
         now: the correction in force, for a scan that was made without one.
 
     Raises:
@@ -303,11 +314,12 @@ class Served:
         self._lock = threading.Lock()
 
     def say(self, document: dict[str, Any]) -> None:
-        """The surface is the viewer's; what comes after it goes to pages as it is."""
+        """Print a document: its surface, for the viewer, apart from the rest, which
+        goes to pages."""
         self._write(json.dumps(document.pop("surface", None)), json.dumps(document))
 
     def answer(self, told: object, content: bytes = b"") -> None:
-        """To what was asked, in order."""
+        """Write the answer to a request; answers keep the requests' order."""
         self._write("answer", str(len(content)), json.dumps(told), content=content)
 
     def _write(self, *words: str, content: bytes = b"") -> None:
@@ -317,7 +329,13 @@ class Served:
 
 
 def answer(held: Held, served: Served, asked: list[str]) -> None:
-    """Answer one line of standard input."""
+    """Answer one line of standard input.
+
+    Args:
+        held: volumes of the process.
+        served: writer of the answers.
+        asked: words of the line: `block NAME`, `voxel X Y Z` or `compare JSON`.
+    """
     match asked:
         case ["block", name] if name in held.volumes:
             most = MOST_VOXELS if held.about["past"] else MOST_GROWING
@@ -340,18 +358,18 @@ def answer(held: Held, served: Served, asked: list[str]) -> None:
 def _told(held: Held, work: Callable[[], object], problem: str = "problem") -> None:
     try:
         work()
-    except Exception as error:  # whatever it is, the page says it instead of waiting for ever
+    except Exception as error:  # of any kind: the page shows it instead of waiting for ever
         known = isinstance(error, (TwinError, OSError, ValueError))
         held.keep(**{problem: str(error) if known else f"{type(error).__name__}: {error}"})
 
 
 def main() -> None:
-    """The process: what was asked for in a thread, questions from standard input meanwhile."""
+    """Run the process: the volume in a thread, requests from standard input meanwhile."""
     parent, served = os.getppid(), Served()
     os.nice(5)  # neither twin nor viewer waits for a volume
     warm()
     if not (line := sys.stdin.readline()):
-        return  # nobody needed it
+        return  # the viewer ended without a request
     folder, side, *past = line.rstrip("\n").split("\t")
     about = {"name": Path(folder).name, "side": int(side), "past": bool(past)}
     held = Held(served.say, about)

@@ -1,4 +1,5 @@
-"""The process of `live_volume`: one at a time, and pages ask it for what they draw."""
+"""The process of `live_volume`: one at a time, with requests of pages for their
+volumes."""
 
 from __future__ import annotations
 
@@ -18,22 +19,23 @@ from flexdt.runtime.workers import ENVIRONMENT
 PROGRAM: Final = "flexdt.clients.viewer.volumes.live_volume"
 LINE_BYTES: Final = 4 << 20
 SINGLE: Final = {name: ones for name, ones in ENVIRONMENT.items() if not name.startswith("NUMBA")}
-"""The process itself says how many threads its kernels have."""
+"""Environment of the process, which sets the number of threads of its kernels itself."""
 Answer = tuple[dict[str, Any], bytes]
 Wish = tuple[str, ...]
-"""What the process reads first."""
+"""First line of the process: folder, side and perhaps `past`."""
 
 
 def wish(folder: Path, side: int, past: bool) -> Wish:
-    """The volume of a data set, with so many voxels a side; the whole one of a past scan."""
+    """Make the request for the volume of a data set, with so many voxels a side; a
+    past scan's is complete."""
     return str(folder.absolute()), str(side), *(["past"] if past else [])
 
 
 class LiveReconstruction:
-    """The one process of a viewer, for the data set that was asked for last.
+    """The one process of a viewer, for the data set requested last.
 
     Args:
-        tell: gets its lines.
+        tell: called with its lines.
     """
 
     def __init__(self, tell: Callable[[str], None]) -> None:
@@ -46,12 +48,14 @@ class LiveReconstruction:
         self._wanted: deque[asyncio.Future[Answer]] = deque()
 
     def warm(self) -> None:
-        """Have a process ready that has loaded what it needs: that takes longer than a slice."""
+        """Start a process in reserve that has loaded its libraries: that takes longer
+        than a slice."""
         if self._spare is None and self._task is None:
             self._spare = asyncio.create_task(_started())
 
     def grow(self, folder: Path, side: int, past: bool = False) -> None:
-        """Grow the volume of a data set, unless that is being done; the last line comes again."""
+        """Start to grow the volume of a data set; if that runs already, its last line
+        is sent again."""
         asked = wish(folder, side, past)
         if asked == self._asked:
             if self.newest:
@@ -62,7 +66,7 @@ class LiveReconstruction:
         self._task = watched(self._follow(*asked), "a live reconstruction")
 
     def stop(self) -> None:
-        """End what is under way."""
+        """End the running reconstruction."""
         if self._task is not None:
             self._task.cancel()
             self._ending = self._task
@@ -80,24 +84,38 @@ class LiveReconstruction:
             await process.wait()
 
     def _hang_up(self) -> None:
-        """Nobody answers any more who has been asked for a slice."""
+        """Cancel all open requests: the process no longer answers."""
         self._writer = None
         while self._wanted:
             self._wanted.popleft().cancel()
 
     async def ask(self, asked: Wish, *words: str) -> Answer | None:
-        """What the process answers, and bytes behind it; None while there is none, or once it
-        has another volume than the one `asked` for."""
+        """Send a request to the process and wait for its answer.
+
+        Args:
+            asked: the volume that it must have.
+            words: of the request.
+
+        Returns:
+            The answer, and its bytes; None without a process, or if it has another
+            volume.
+        """
         if self._writer is None or asked != self._asked:
             return None
         wanted: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
         self._wanted.append(wanted)
         self._writer.write("\t".join(words).encode() + b"\n")
-        with suppress(asyncio.CancelledError):  # somebody has asked for another volume
+        with suppress(asyncio.CancelledError):  # another volume was requested meanwhile
             return await wanted
         return None
 
     async def _follow(self, *asked: str) -> None:
+        """Run a process for a volume: pass its lines on, and its answers to their
+        requests.
+
+        Args:
+            asked: the words of its first line.
+        """
         spare, self._spare = self._spare, None
         process = await (spare or _started())
         assert process.stdout is not None
@@ -116,7 +134,7 @@ class LiveReconstruction:
                     self.newest = line.decode()
                     self._tell(self.newest)
             self._hang_up()
-            await process.wait()  # to kill what has just ended would take its code from the loop
+            await process.wait()  # killing an ended process would lose its exit code
         finally:
             if process.returncode is None:
                 process.kill()

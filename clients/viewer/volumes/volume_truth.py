@@ -1,7 +1,8 @@
-"""A volume beside what its sample is made of, where the twin knows that.
+"""A volume compared with the composition of its sample, where the twin knows that.
 
-The truth is the phantom of the scan's record, where it stood on the stage, at the energy at which
-phantoms state their attenuation. The twin's hidden misalignment is not part of it and is not read.
+The truth is the phantom of the scan's record, at its place on the stage, at the energy at
+which phantoms state their attenuation. The twin's hidden misalignment is not part of it
+and is not read.
 """
 
 from __future__ import annotations
@@ -26,18 +27,26 @@ from flexdt.twin.scanner.state import StagePlacement
 
 Mask = npt.NDArray[np.bool_]
 LEVELS: Final = 240
-"""Bins of the attenuation's logarithm in which the sample's main material is looked for."""
+"""Number of bins of the attenuation's logarithm in which the sample's main material is
+sought."""
 NOTHING: Final = 1e-6
 """Less attenuation than any matter's [1/mm]."""
 ALIKE: Final = 0.1
-"""Voxels are of the main material within this part of its attenuation."""
+"""Largest relative difference from the attenuation of the main material."""
 
 
 def truth_of(dataset: DataSet, like: Volume) -> Float32Array:
-    """The sample's attenuation [1/mm] on the grid of a volume, (z, y, x).
+    """Compute the sample's attenuation [1/mm] on the grid of a volume.
+
+    Args:
+        dataset: its sample, and its place on the stage.
+        like: the grid.
+
+    Returns:
+        (z, y, x) float32.
 
     Raises:
-        TwinError: nobody has said what the sample is.
+        TwinError: the sample is not known.
     """
     document = dataset.document
     name = "" if document is None else document.sample.name
@@ -50,7 +59,7 @@ def truth_of(dataset: DataSet, like: Volume) -> Float32Array:
     phantom, voxel = load_phantom(name), min(like.voxel_xyz)
     if phantom.is_voxels:
         whole, data, half = phantom.volume(), phantom.volume().data, 0.0
-    else:  # means over two voxels a side, which lie half a voxel before the later one
+    else:  # means over two voxels a side, centred half a voxel before the later one
         whole = phantom.volume(voxel / 2)
         data, half = np.pad(whole.data, (0, 1)), 0.5
         for axis in range(3):
@@ -71,11 +80,12 @@ def truth_of(dataset: DataSet, like: Volume) -> Float32Array:
         inside = np.tensordot(back, seen, axes=1) - np.reshape(whole.center_mm, (3, 1, 1))
         at = inside / np.reshape(whole.voxel_xyz, (3, 1, 1)) + ends.reshape(3, 1, 1) + half
         out[k] = ndimage.map_coordinates(data, at[::-1], order=1, mode="constant")
-    return np.maximum(out, 0.0, out=out)  # what a hole takes away leaves a rounding error
+    return np.maximum(out, 0.0, out=out)  # a hole leaves a rounding error
 
 
 def placement(folder: Path) -> StagePlacement:
-    """Where the sample of a data set stood, as its job's record has it; without one: in place."""
+    """Read the place of a data set's sample from its job's record; without one: no
+    offset."""
     try:
         file = folder.parent / "jobs" / f"{file_stem(folder.name)}.json"
         return StagePlacement(**json.loads(file.read_text("utf-8"))["sample"]["offset"])
@@ -84,7 +94,7 @@ def placement(folder: Path) -> StagePlacement:
 
 
 def figures(values: Float32Array, truth: Float32Array, voxel_mm: float) -> dict[str, Any]:
-    """What is measured in a volume, and the same of the truth.
+    """Measure figures of a volume, and the same of the truth.
 
     Args:
         values: (z, y, x) [1/mm], not a number where no data cover.
@@ -92,9 +102,12 @@ def figures(values: Float32Array, truth: Float32Array, voxel_mm: float) -> dict[
         voxel_mm: edge of a voxel.
 
     Returns:
-        `attenuation` of the main material, a voxel and more inside it [1/mm]; `void` part of what
-        its outlines enclose, layer by layer; `x_mm`, `y_mm`, `z_mm` from face to face; each as
-        measured and as true, None where nothing can be said. And the `rms` difference [1/mm] in
+        `attenuation` of the main material, a voxel and more inside it [1/mm]; `void` part
+        of the
+        volume within its outlines, layer by layer; `x_mm`, `y_mm`, `z_mm` from face to
+        face; each as
+        measured and as true, None where it cannot be measured. And the `rms` difference
+        [1/mm] in
         the box around the sample.
     """
     mu = main_level(truth)
@@ -130,12 +143,13 @@ def figures(values: Float32Array, truth: Float32Array, voxel_mm: float) -> dict[
 
 
 def told(value: float) -> float | None:
-    """A figure for JSON, which knows no NaN."""
+    """Convert a figure for JSON: NaN becomes None."""
     return value if math.isfinite(value) else None
 
 
 def main_level(truth: Float32Array) -> float:
-    """The attenuation that most of the sample has [1/mm]; partly filled voxels differ all."""
+    """Find the attenuation of most of the sample [1/mm]; partly filled voxels all
+    differ."""
     there = np.log(truth[truth > NOTHING].astype(np.float64))
     if not there.size:
         return math.nan
@@ -149,15 +163,19 @@ def main_level(truth: Float32Array) -> float:
 
 
 def extent(values: Float32Array, truth: Float32Array, axis: int, seen: float, mu: float) -> float:
-    """Voxels from one face to the other along an axis, where the truth is widest.
+    """Measure the extent from one face to the other along an axis, where the truth is
+    widest [voxels].
 
-    The profile is the median over all lines that meet both faces, so that neither noise nor streaks
-    count, and is followed to half of the material's attenuation, between two voxels.
+    The profile is the median over all lines that meet both faces, so that neither noise
+    nor streaks count, and is followed to half of the material's attenuation, between two
+    voxels.
 
     Args:
-        values: measured, or the truth itself; `seen` is their attenuation of the main material.
-        truth: which says where the faces are; `mu` is its own attenuation.
+        values: measured, or the truth itself.
+        truth: with the faces.
         axis: of both arrays.
+        seen: attenuation of the main material in `values` [1/mm].
+        mu: the same in `truth` [1/mm].
     """
     solid = np.moveaxis(truth, axis, -1) > mu / 2
     there = solid.any(axis=-1)
