@@ -1,8 +1,10 @@
-"""The connections of browsers to the viewer's front: which of them stay where too many come.
+"""Connections of browsers to the viewer's front, and which of them give way when there
+are too many.
 
-One that has not sent a whole request with the token (without one: a request of the viewer's own
-site) waits in a room; so does, in a second room, a request that is being answered. Pages and views
-have places, which the front counts. `runtime/waiting_room.py` says which connection gives way.
+One that has not sent a complete request with the token (without one: a request of the
+viewer's own site) waits in a room; so does, in a second room, a request that is being
+answered. Pages and views have places, which the front counts. `runtime/waiting_room.py`
+decides which connection gives way.
 """
 
 from __future__ import annotations
@@ -17,11 +19,13 @@ from flexdt.runtime.process import tune
 from flexdt.runtime.waiting_room import Room, neighbourhood
 
 ANSWERED: Final = 64
-"""Requests with the token that may be in service at a time, beside pages and views."""
+"""Largest number of requests with the token in service at a time, in addition to pages
+and views."""
 MAX_HELD: Final = 256 << 20
-"""Bytes of messages that have begun and not ended, of all connections together."""
+"""Largest size of unfinished messages, of all connections together [bytes]."""
 FAIR: Final = 1 << 20
-"""A connection that holds no more than this is not cut for what others hold."""
+"""Size up to which a connection's unfinished message is never dropped for those of
+others [bytes]."""
 
 
 class Admission:
@@ -33,7 +37,7 @@ class Admission:
         self.held = 0
 
     def connection(self, *given: Any, **more: Any) -> BrowserConnection:
-        """What serves one connection, with what websockets gives it."""
+        """Make the server side of one connection, with the arguments of websockets."""
         return BrowserConnection(self, *given, **more)
 
 
@@ -44,11 +48,11 @@ class BrowserConnection(ServerConnection):
         super().__init__(*given, **more)
         self._admission = admission
         self._held = 0
-        """Bytes that have come since a message was last taken."""
+        """Number of bytes received since a message was last taken."""
         self.address = ""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Wait among those that have said nothing."""
+        """Put the new connection among those that have sent no request."""
         super().connection_made(transport)
         peer = transport.get_extra_info("peername") or ("?", 0)
         self.address = neighbourhood(str(peer[0]))
@@ -56,16 +60,16 @@ class BrowserConnection(ServerConnection):
         self._admission.strangers.enter(self)
 
     def admit(self) -> None:
-        """It has sent a request that is answered."""
+        """Move the connection to those whose request is being answered."""
         self._admission.strangers.leave(self)
         self._admission.answered.enter(self)
 
     def seat(self) -> None:
-        """It has the place of a page or of a view."""
+        """Release its place in the waiting rooms: it has that of a page or of a view."""
         self._admission.answered.leave(self)
 
     def displace(self) -> None:
-        """A newer connection needs the room."""
+        """Close the connection at once: a newer one needs the room."""
         self.transport.abort()
 
     def data_received(self, data: bytes) -> None:
@@ -77,13 +81,13 @@ class BrowserConnection(ServerConnection):
             super().data_received(data)
 
     async def recv(self, decode: bool | None = None) -> Any:
-        """The next message."""
+        """Receive the next message."""
         message = await super().recv(decode)
         self._hold(0)
         return message
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """It has ended, wherever it was."""
+        """Remove the ended connection from its room."""
         self._hold(0)
         self._admission.strangers.leave(self)
         self._admission.answered.leave(self)

@@ -31,14 +31,14 @@ from flexdt.protocol.state_model import State
 from flexdt.twin.machine.description import Machine, Profile
 
 Form = Literal["html", "viser"]
-"""Of an exported file: an HTML page by itself, or viser's own format."""
+"""Form of an exported file: an HTML page by itself, or viser's own format."""
 FRAMES: Final = 240
 REPLAY_S: Final = 12.0
 LIGHT, DARK = (246, 248, 251), (16, 19, 25)
 
 
 def picture(client: viser.ClientHandle, width: int, height: int, dark: bool) -> bytes:
-    """A view as PNG, on the page's background.
+    """Render a view as PNG, on the page's background.
 
     Raises:
         RuntimeError, TimeoutError: the browser does not answer.
@@ -53,7 +53,8 @@ def scene_file(
     server: viser.ViserServer, camera: Standpoint, nodes: Nodes, title: str, beside: str,
     form: Form, dark: bool,
 ) -> bytes:  # fmt: skip
-    """The live scene as a file: as the page sees it, and `beside` over it (HTML)."""
+    """Export the live scene to a file: as the page shows it, with `beside` over it
+    (HTML)."""
     serializer = server.get_scene_serializer()
     look_from(serializer, camera, nodes)
     return _file(serializer, form, dark, title, beside)
@@ -70,7 +71,18 @@ def replay_file(
     form: Form,
     dark: bool,
 ) -> bytes:
-    """A plan, or a scan that was made, as a file that plays it."""
+    """Export a plan, or a recorded scan, to a file that plays it.
+
+    Args:
+        machine, profile: of the scene.
+        state: of the twin; its motors and X-rays are replaced.
+        look: the sample.
+        planned: motor positions over time.
+        looks: part -> its own mesh; None for none.
+        title: of the file.
+        form: html or viser.
+        dark: the page's background.
+    """
     scenes = Scenes()
     server = scenes.server
     try:
@@ -98,13 +110,18 @@ def _file(serializer: Any, form: Form, dark: bool, title: str, beside: str = "")
 
 
 def title_of(state: State | None, what: str) -> str:
-    """Of a file: the sample, when it was made, and what it is."""
+    """Make the title of a file: the sample, date and time, and `what` it is."""
     sample = (state.sample.name if state is not None else "") or "no sample"
     return f"{sample} · {time.strftime('%Y-%m-%d %H:%M')} · flexdt {what}"
 
 
 def beside(state: State | None, image: ShownImage | None) -> str:
-    """A radiograph and the values that belong to it, as HTML over a scene."""
+    """Format a radiograph and its values as HTML over a scene.
+
+    Args:
+        state: of the twin; None gives "".
+        image: None for none.
+    """
     if state is None:
         return ""
     at = state.geometry
@@ -126,7 +143,7 @@ def beside(state: State | None, image: ShownImage | None) -> str:
 
 
 def at_positions(state: State, positions: dict[str, float]) -> State:
-    """The state with its motors elsewhere and X-rays on."""
+    """Copy the state with its motors elsewhere and X-rays on."""
     axes = {
         name: axis.model_copy(update={"position": positions.get(name, axis.position)})
         for name, axis in state.axes.items()
@@ -136,7 +153,7 @@ def at_positions(state: State, positions: dict[str, float]) -> State:
 
 
 def standpoint(client: viser.ClientHandle) -> Standpoint:
-    """Where somebody looks from now."""
+    """Return the present camera of a client."""
     c = client.camera
     position, look_at, up = (
         (float(v[0]), float(v[1]), float(v[2])) for v in (c.position, c.look_at, c.up_direction)

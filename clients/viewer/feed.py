@@ -20,7 +20,7 @@ from flexdt.runtime.log import log
 
 IMAGE_HZ: Final = 12.0
 SETTLE_S: Final = 0.3
-"""An image that no other follows within this time is shown in full."""
+"""Time without a further image after which an image is shown in full [s]."""
 
 Take = Callable[[ShownImage, bool], None]
 """Called in a worker thread with an image and whether to send it coarse."""
@@ -32,7 +32,7 @@ class ImageFeed:
     Args:
         address: of the twin.
         kind: line_integral or counts.
-        take: what to do with an image.
+        take: called with each image.
         died: called when it cannot go on.
     """
 
@@ -73,7 +73,7 @@ class ImageFeed:
         return bool(self._tasks)
 
     def again(self) -> None:
-        """Show the newest image once more, for a new page or in another window."""
+        """Show the newest image again, for a new page or in another window."""
         if self._raw is not None:
             self._due.set()
 
@@ -85,6 +85,8 @@ class ImageFeed:
             self._due.set()
 
     async def _work(self) -> None:
+        """Take each new image coarse at once, and in full once no other follows within
+        `SETTLE_S`."""
         shown_coarse, sound = False, True
         while True:
             try:
@@ -110,7 +112,11 @@ class ImageFeed:
 
 
 def radiograph(params: Mapping[str, object], twin: str = "") -> ShownImage:
-    """The image of a `projection` event, made by that run of the twin.
+    """Read the image of a `projection` event, made by that run of the twin.
+
+    Args:
+        params: of the event.
+        twin: run of the twin.
 
     Raises:
         RpcError: the event holds no image.

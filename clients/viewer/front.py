@@ -41,22 +41,26 @@ from flexdt.runtime.process import TLS_HANDSHAKE_S, one_at_a_time
 
 COOKIE: Final = "flexdt_viewer"
 MAX_FROM_PAGE: Final = 16 << 20
-"""Bytes of a message of a browser: a script of 8 MiB as JSON, a piece of an upload, a picture."""
+"""Largest message of a browser [bytes]: a script of 8 MiB as JSON, a piece of an
+upload, a picture."""
 LAST: Final = {"Connection": "close"}
-"""websockets closes after a plain answer; who is not told sends the next request into nothing."""
+"""Header of plain answers: websockets closes after them; a client without it would
+send its next request to a closed connection."""
 SILENT_S: Final = 60.0
-"""A browser that does not answer a ping within this time has gone; busy machines are slow."""
+"""Time without an answer to a ping after which a browser counts as gone [s]; busy
+machines are slow."""
 STILL_S: Final = 8.0
-"""A picture that takes longer is none: websockets cuts a connection that has no answer for 10 s."""
+"""Time limit for a picture [s]: websockets cuts a connection that has no answer for 10
+s."""
 RELAYED_HZ: Final = 500.0
-"""Messages of one view that are passed to viser in a second; a hand that drags sends 60."""
+"""Largest rate of messages of one view to viser [1/s]; a dragging hand sends 60."""
 GUESS_S: Final = 0.4
-"""How long the answer to a wrong token takes; wrong ones wait for each other."""
+"""Delay of the answer to a wrong token [s]; wrong ones wait for each other."""
 PAGE_PATH: Final = re.compile(r"/ws/([0-9a-f]{8,64})")
 SCENE_PATH: Final = re.compile(r"/scene/([0-9a-f]{8,64})/([a-z]{1,16})")
 DOWNLOAD_PATH: Final = re.compile(r"/download/([0-9a-f]{32})")
 FOR_GOOD: Final = "private, max-age=31536000, immutable"
-"""Of what changes its name with its content."""
+"""Cache header of files whose name changes with their content."""
 NO_TOKEN: Final = "This viewer wants a token: open its first page, and type it there.\n"
 POLICY: Final = (
     "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; connect-src 'self' data: blob: "
@@ -103,6 +107,17 @@ class Front:
         max_pages: int = 64,
         still: Still | None = None,
     ) -> None:
+        """Prepare the page of the scenes and the checks; `start` listens.
+
+        Args:
+            page: serves a page's connection.
+            connect: opens a connection to viser.
+            scene_html: viser's page.
+            downloads: id -> file; each is fetched once.
+            token: required of browsers; None for none.
+            max_scenes, max_pages: largest numbers of open views and pages.
+            still: makes a picture of the scene; None for none.
+        """
         self._page, self._connect = page, connect
         self.doorkeeper = MessageFilter()
         self._max_scenes, self.scenes = max_scenes, 0
@@ -130,7 +145,11 @@ class Front:
         return int(next(iter(self._server.sockets)).getsockname()[1])
 
     async def start(self, host: str, port: int, ssl: tls.SSLContext | None = None) -> None:
-        """Listen; port 0 is any free one.
+        """Start to listen; port 0 is any free one.
+
+        Args:
+            host, port: to listen on.
+            ssl: a server's TLS context; None for plain TCP.
 
         Raises:
             AccessError: others can reach the address and there is no token.
@@ -168,7 +187,15 @@ class Front:
     # -- plain requests ----------------------------------------------------------------------
 
     async def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
-        """A response, or None to go on with a WebSocket."""
+        """Answer a request; None to go on with a WebSocket.
+
+        Requests of other sites and without the token are rejected; a still picture is
+        waited for.
+
+        Args:
+            connection: of the browser; an admitted one moves to the second room.
+            request: its request.
+        """
         try:
             url = urlsplit(request.path)
             denied = self._foreign(request) or await self._stranger(connection, request, url)
@@ -186,6 +213,16 @@ class Front:
         return denied or self._content(request, url)
 
     def _content(self, request: Request, url: SplitResult) -> Response | None:
+        """Answer an admitted request with a page, a file of the page, a download or an
+        error.
+
+        Args:
+            request: of the browser.
+            url: its parts.
+
+        Returns:
+            The response; None for a known WebSocket's path.
+        """
         if request.headers.get("Upgrade", "").lower() == "websocket":
             known = PAGE_PATH.fullmatch(url.path) or SCENE_PATH.fullmatch(url.path)
             return None if known else _plain(http.HTTPStatus.NOT_FOUND, "no such connection")
@@ -213,7 +250,8 @@ class Front:
         return _kept(request, content, f"{kind}; charset=utf-8")
 
     def _foreign(self, request: Request) -> Response | None:
-        """The response to a request from another site's page, or None."""
+        """Check that a request is not from another site's page; returns the error, or
+        None."""
         host = request.headers.get("Host", "")
         if self._loopback and is_rebound(host):
             return _plain(http.HTTPStatus.FORBIDDEN, f"this viewer is not {host}")
@@ -225,7 +263,18 @@ class Front:
     async def _stranger(
         self, connection: ServerConnection, request: Request, url: SplitResult
     ) -> Response | None:
-        """The response to a request without a valid cookie; a valid token sets one; None admits."""
+        """Check the token or the cookie of a request.
+
+        A valid token sets the cookie; a wrong one is logged and answered slowly.
+
+        Args:
+            connection: of the browser, for the log.
+            request: with its cookie.
+            url: with the token.
+
+        Returns:
+            The response to a request without a valid cookie; None admits.
+        """
         if self._token is None:
             return None
         given = parse_qs(url.query).get("token", [None])[0]
@@ -251,6 +300,7 @@ class Front:
     # -- WebSockets --------------------------------------------------------------------------
 
     async def _serve(self, connection: ServerConnection) -> None:
+        """Serve a WebSocket: a page, or a view up to the largest number of views."""
         assert connection.request is not None
         path = urlsplit(connection.request.path).path
         if (match := PAGE_PATH.fullmatch(path)) is not None:
@@ -272,7 +322,8 @@ class Front:
                 self.scenes -= 1
 
     async def _relay(self, browser: ServerConnection, path: str) -> None:
-        """Relay messages between a browser and viser; `MessageFilter` filters those to viser."""
+        """Pass messages between a browser and viser; `MessageFilter` filters those to
+        viser."""
         with contextlib.suppress(OSError, ConnectionClosed, InvalidHandshake):
             async with self._connect(path, browser.subprotocol) as viser:
                 pumps = [
@@ -298,8 +349,10 @@ async def _down(viser: ClientConnection, browser: ServerConnection) -> None:
 
 
 def _quiet() -> logging.Logger:
-    """The library's logger, without a traceback for each connection that sends nothing: neither of
-    a page's to us, nor of ours to viser, which a page that leaves at once takes with it.
+    """Set up the library's logger, without a traceback for each connection that sends
+    nothing.
+
+    Such are pages' connections to us, and ours to viser when a page leaves at once.
     """
     front = logging.getLogger("websockets.front")
     for logger in (front, logging.getLogger("websockets.server")):
@@ -317,7 +370,7 @@ def _pass(token: str) -> str:
 
 
 def _same(given: str | None, wanted: str) -> bool:
-    """Constant-time comparison; what came may hold anything."""
+    """Compare in constant time; the received text may hold anything."""
     return given is not None and hmac.compare_digest(
         given.encode("utf-8", "surrogateescape"), wanted.encode()
     )
@@ -333,7 +386,8 @@ def _cookie(request: Request) -> str | None:
 
 
 def _kept(request: Request, body: bytes, kind: str, how_long: str = "no-cache") -> Response:
-    """What a browser may keep: it is sent again only where it has changed, and packed."""
+    """Make a response that a browser may keep: sent again only where it has changed,
+    and packed."""
     tag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
     more = {"ETag": tag, "Cache-Control": how_long, "Vary": "Accept-Encoding", **LAST}
     if tag in request.headers.get("If-None-Match", ""):
@@ -354,6 +408,14 @@ def _response(
     more: Mapping[str, str] | None = None,
     status: http.HTTPStatus = http.HTTPStatus.OK,
 ) -> Response:
+    """Make a response with the headers of all content: length, type, policy, no cache.
+
+    Args:
+        body: content.
+        kind: its media type.
+        more: further headers, which override.
+        status: of HTTP.
+    """
     headers = Headers(
         {
             "Content-Type": kind,

@@ -44,7 +44,14 @@ if TYPE_CHECKING:
 
 
 async def run(options: ViewerSettings, out: TextIO) -> int:
-    """Serve until SIGTERM or SIGINT, or until a part has died that nothing is shown without.
+    """Serve until SIGTERM or SIGINT, or until an essential part has failed.
+
+    Args:
+        options: addresses, token, certificates, limits and files of the process.
+        out: receives the ready line.
+
+    Returns:
+        The exit code.
 
     The ready line goes to `out`; returns the exit code.
     """
@@ -79,7 +86,11 @@ async def run(options: ViewerSettings, out: TextIO) -> int:
 
 
 def viewer_pages(viewer: Viewer) -> Pages:
-    """The pages for monitoring of a viewer that runs."""
+    """Make the pages for monitoring of a running viewer.
+
+    Args:
+        viewer: started.
+    """
 
     def health() -> dict[str, object]:
         return {

@@ -1,12 +1,15 @@
-"""One open page: its own connection to the twin, and an outbox in which only the newest survives.
+"""One open page: its own connection to the twin, and an outbox in which only the newest
+survives.
 
-A page acts for one person: it acquires and loses control by itself, and its requests end with it.
-Answers and notes are sent in order, and a page that does not read them is closed. States and images
-replace older ones that have not gone out, so a slow browser delays nobody else.
+A page acts for one person: it acquires and loses control by itself, and its requests end
+with it. Answers and notes are sent in order, and a page that does not read them is
+closed. States and images replace older ones that have not gone out, so a slow browser
+delays no other.
 
-The page acknowledges states and parts of images, and few of either are on their way: what
-is queued in sockets cannot be replaced by something newer, and on a slow link seconds of it would
-be. Images go in parts, so that a state waits for a part of an image and not for a whole one.
+The page acknowledges states and parts of images, and few of either are on their way: data
+queued in sockets cannot be replaced by newer ones, and on a slow link that would be
+seconds of them. Images go in parts, so that a state waits for a part of an image and not
+for all of it.
 """
 
 from __future__ import annotations
@@ -33,22 +36,26 @@ from flexdt.runtime.log import log, traced
 
 MAX_NOTES: Final = 1000
 MAX_ASKED: Final = 64
-"""Requests of a page under way; those that overtake (stop, E-stop, abort) are never too many."""
+"""Largest number of a page's running requests; urgent ones (stop, E-stop, abort) do
+not count."""
 MAX_PARTS: Final = 500_000
-"""Parts of a request's JSON, about; each costs some hundred bytes once it is read."""
+"""Largest number of parts of a request's JSON, about; each costs some hundred bytes
+once read."""
 MAX_WORD: Final = 200
 DRAG_S: Final = 0.1
 TRY_AGAIN: Final = 1013
 """WebSocket's code for "come back later"; the reason is for people."""
 ON_THE_WAY: Final = {"state": 2, "image": 3, "volume": 1}
-"""States, parts of images, and slices, that the page has not acknowledged yet, at most."""
+"""Largest number of states, parts of images, and slices, that the page has not
+acknowledged yet."""
 TOOK: Final = {f'{{"took":"{slot}"}}': slot for slot in ON_THE_WAY}
 """A page's acknowledgements."""
 PART_BYTES: Final = 10_240
-"""Part of an image. Three hold most images in motion, and are an eighth of a second of 2 Mbit/s."""
+"""Size of a part of an image [bytes]. Three hold most images in motion, and are an
+eighth of a second of 2 Mbit/s."""
 LARGE_PART_BYTES: Final = 131_072
 QUICK_S: Final = 0.02
-"""Parts become large while acknowledgements come so soon."""
+"""Time of an acknowledgement below which parts become large [s]."""
 HIDDEN: Final = frozenset({"session.hello", "state.subscribe", "state.unsubscribe"})
 """Methods of the wire that a page does not use: its viewer does."""
 
@@ -75,23 +82,32 @@ class Page:
         local: Mapping[str, Local],
         person: str = "a visitor",
     ) -> None:
+        """Prepare the page's state and its connection to the twin; `run` serves.
+
+        Args:
+            id: of the page.
+            connection: to the browser.
+            address: of the twin.
+            local: the viewer's own methods, by name.
+            person: name of the page's user.
+        """
         self.id = id
         self.kind = "line_integral"
         self.dark = self.live = False
         self.shown = Shown()
         self.plan: Any = None
         self.orbit: Any = None
-        """The focal spot's path over the plan, for the scenes of this page that open later."""
+        """The focal spot's path over the plan, for later scenes of this page."""
         self.recorded: str | None = None
         """The data set whose images this page shows instead of live ones."""
         self.block = ""
-        """The key of the last block of a volume that it was offered."""
+        """The key of the last block of a volume offered to the page."""
         self._connection, self._local = connection, local
         self.link = KeptConnection(address, person, on_change=self._link_changed)
         self._notes: deque[str] = deque()
         self._newest: dict[str, str | bytes] = {}
         self._sent_at: dict[str, deque[float]] = {slot: deque() for slot in ON_THE_WAY}
-        """When what the page has not acknowledged was sent."""
+        """Times at which messages not yet acknowledged were sent."""
         self._image, self._part = memoryview(b""), PART_BYTES
         self._due = asyncio.Event()
         self._over = asyncio.Event()
@@ -101,7 +117,7 @@ class Page:
         self._asked = self._busy = 0
 
     async def run(self) -> None:
-        """Serve until the browser goes, or takes nothing any more."""
+        """Run until the browser leaves, or no longer reads."""
         for work in (self.link.run(), self._send(), self._read()):
             self._start(work, "a page's connection", self._over.set)
         try:
@@ -146,7 +162,8 @@ class Page:
         self._due.set()
 
     def drag(self, targets: dict[str, float]) -> None:
-        """A stage is dragged in one of this page's frames; the newest targets win."""
+        """Move a stage that is dragged in one of this page's frames; the newest
+        targets win."""
         self._dragged = targets
         if self._dragging is None or self._dragging.done():
             self._dragging = self._start(self._follow(), "dragging")
@@ -169,7 +186,8 @@ class Page:
                     await self._connection.send(content)
 
     def _next(self) -> str | bytes | None:
-        """What is sent next: what must arrive, then the newest content, then a part of an image."""
+        """Select the next message: answers and notes, then the newest content, then a
+        part of an image."""
         if self._notes:
             return self._notes.popleft()
         for slot in self._newest:
@@ -183,7 +201,7 @@ class Page:
         return (b"\0" if self._image else b"\1") + part
 
     def _may_send(self, slot: str) -> bool:
-        """Whether there is room for one more on the way; it is counted then."""
+        """Check that there is room for one more message on the way, and count it."""
         if (sent := self._sent_at.get(slot)) is None:
             return True
         if len(sent) >= ON_THE_WAY[slot]:
@@ -200,6 +218,14 @@ class Page:
         self._due.set()
 
     async def _handle(self, text: str) -> None:
+        """Answer a request of the page with its result or an error.
+
+        Errors of any kind are sent to the page; too many requests at a time are rejected,
+        except urgent ones.
+
+        Args:
+            text: JSON with id, method and params.
+        """
         id: object = None
         try:
             id, request = _read(text)
@@ -237,7 +263,7 @@ class Page:
         try:
             return without_bytes(await self.link.request(method, params))
         except Unsendable:
-            parse_params(METHODS[method], params)  # says which field, and what is allowed
+            parse_params(METHODS[method], params)  # names the field and the allowed values
             raise
 
     def _fail(self, id: object, error: RpcError) -> None:
@@ -252,7 +278,8 @@ class Page:
 
 
 def _words(error: RpcError | ConnectionLost) -> str:
-    """An error's message for people: with the page's button instead of the wire's method."""
+    """Format an error's message for people: with the page's button instead of the
+    wire's method."""
     if not isinstance(error, RpcError):
         return str(error)
     match error.data:
@@ -262,7 +289,7 @@ def _words(error: RpcError | ConnectionLost) -> str:
 
 
 def _read(text: str) -> tuple[str | int | None, dict[str, Any]]:
-    """Id and content of a message; one that would take very much memory is not read.
+    """Read id and content of a message, unless it would take very much memory.
 
     Raises:
         ValueError: it is no object with an id that can be answered.
@@ -281,7 +308,7 @@ def _read(text: str) -> tuple[str | int | None, dict[str, Any]]:
 
 
 def _request(message: dict[str, Any]) -> tuple[str, dict[str, Any]]:
-    """Method and parameters of a message.
+    """Read method and parameters of a message.
 
     Raises:
         ValueError: it has none.
@@ -293,7 +320,8 @@ def _request(message: dict[str, Any]) -> tuple[str, dict[str, Any]]:
 
 
 def without_bytes(value: Any) -> Any:
-    """Plain data for JSON; a page gets images another way."""
+    """Convert to plain data for JSON; bytes become null, as a page gets images another
+    way."""
     if isinstance(value, Mapping):
         return {str(k): without_bytes(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):

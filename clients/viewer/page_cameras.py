@@ -24,9 +24,11 @@ from flexdt.clients.viewer.viser_gate import Scenes, set_nodes
 from flexdt.twin.geometry.conventions import FloatArray
 
 FILLS = 1.3
-"""Of the distance at which a ball that is looked at fills the picture."""
+"""Distance of the camera, over the distance at which the ball in view fills the
+picture."""
 TOUCHED = 0.005
-"""Part of its distance by which a camera stands elsewhere once a person has moved it."""
+"""Displacement of a camera, as a part of its distance, from which it counts as moved
+by a person."""
 
 
 @dataclass(frozen=True)
@@ -45,44 +47,52 @@ class SceneClients:
     """
 
     def __init__(self, scenes: Scenes) -> None:
+        """Register for viser's clients as they connect and leave.
+
+        Args:
+            scenes: viser's server.
+        """
         self._scenes, self._server = scenes, scenes.server
         self._lock = threading.Lock()
         self._who: dict[int, Who] = {}
         self._sent: dict[int, Standpoint] = {}
-        """Client -> where its camera was put last; a person may have moved it since."""
+        """Client -> its camera as put last; a person may have moved it since."""
         self._theme: dict[str, tuple[bool, bool]] = {}
         """Page -> whether its frames are dark, and finely lit."""
         self._shown: dict[int, tuple[int, Nodes]] = {}
-        """Client -> what was built when, and how its nodes stand."""
+        """Client -> number of messages when built, and the state of its nodes."""
         self._beam: Standpoint | None = None
         self.cameras: dict[str, Fitted] = {}
-        """View -> what it holds; the beam's eye, which follows the machine, has none."""
+        """View -> its points and directions; the beam's eye, which follows the
+        machine, has none."""
         self.joined: Callable[[viser.ClientHandle, str], None] = lambda client, page: None
         """Called in one of viser's threads with a new frame and its page."""
         self._server.on_client_connect(self._connected)
         self._server.on_client_disconnect(self._gone)
 
     def of(self, page: str, view: str | None = None) -> list[viser.ClientHandle]:
-        """Clients that show `view` (any, if None) of `page`."""
+        """List the clients that show `view` (any, if None) of `page`."""
         with self._lock:
             ids = [i for i, w in self._who.items() if w.page == page and view in (None, w.view)]
         clients = self._server.get_clients()
         return [clients[i] for i in ids if i in clients]
 
     def with_names(self) -> list[tuple[viser.ClientHandle, str]]:
-        """Clients whose views have names, and their pages: the beam's eye shows pixels."""
+        """List the clients whose views have names, with their pages: the beam's eye
+        shows pixels."""
         with self._lock:
             whose = {i: w.page for i, w in self._who.items() if w.view != "beam"}
         clients = self._server.get_clients()
         return [(clients[i], page) for i, page in whose.items() if i in clients]
 
     def show(self, page: str, nodes: Nodes, plain: Nodes, built: int) -> None:
-        """Have a page's frames show nodes so, from a thread that alone calls this.
+        """Set the nodes of a page's frames, from one thread only.
 
         Args:
-            page: whose frames; one that has not got all that is built yet is left for later.
-            nodes, plain: as they are wanted, and as they are built.
-            built: what had been said to all when they were (`Scenes.said`).
+            page: its frames; a frame that has not received all nodes yet is left for
+                later.
+            nodes, plain: as wanted, and as built.
+            built: number of messages to all clients when they were built (`Scenes.said`).
         """
         for client in self.of(page):
             if not self._scenes.heard(id := client.client_id, built):
@@ -95,7 +105,7 @@ class SceneClients:
             self._shown[id] = built, nodes
 
     def page_of(self, client_id: int | None) -> str | None:
-        """The page that a client belongs to."""
+        """Return the page that a client belongs to."""
         with self._lock:
             who = None if client_id is None else self._who.get(client_id)
         return None if who is None else who.page
@@ -107,14 +117,15 @@ class SceneClients:
             self._put(client, camera)
 
     def fit(self, anew: bool = False) -> None:
-        """Have each view hold what it should, unless a person has moved its camera.
+        """Put each view's camera so that it holds its points, unless a person has moved
+        it.
 
         Args:
             anew: put all cameras to their presets, moved or not.
         """
         for view, preset in self.cameras.items():
             for client in self._looking(view):
-                with contextlib.suppress(AssertionError):  # it has not said yet how wide it is
+                with contextlib.suppress(AssertionError):  # its width is not known yet
                     aspect = client.camera.aspect
                     if anew or (self._untouched(client) and not preset.fits(_now(client), aspect)):
                         self._put(client, preset.at(aspect))
@@ -138,7 +149,7 @@ class SceneClients:
             aim(client, replace(preset, position=(x, y, z), look_at=tuple(middle.tolist())))
 
     def theme(self, page: str, dark: bool, fine: bool) -> None:
-        """Light or dark, plainly or finely lit, for all frames of a page."""
+        """Set light or dark, plain or fine light, for all frames of a page."""
         self._theme[page] = dark, fine
         for client in self.of(page):
             _theme(client, dark, fine)
@@ -148,7 +159,7 @@ class SceneClients:
         self._theme.pop(page, None)
 
     def _looking(self, view: str) -> list[viser.ClientHandle]:
-        """Clients that show a view, of any page."""
+        """List the clients that show a view, of any page."""
         with self._lock:
             ids = [i for i, w in self._who.items() if w.view == view]
         clients = self._server.get_clients()
@@ -162,7 +173,7 @@ class SceneClients:
         aim(client, camera)
 
     def _untouched(self, client: viser.ClientHandle) -> bool:
-        """Whether a client's camera still stands where it was put."""
+        """Check that a client's camera is still where it was put."""
         put = self._sent.get(client.client_id)
         if put is None:
             return False
@@ -171,6 +182,11 @@ class SceneClients:
         return apart_m < TOUCHED * reach_m
 
     def _connected(self, client: viser.ClientHandle) -> None:
+        """Register a new client: its page and view, camera and theme.
+
+        Args:
+            client: of viser; its path names page and view.
+        """
         path = self._scenes.path_of(client.client_id)
         match = None if path is None else SCENE_PATH.fullmatch(path)
         if match is None:
@@ -193,7 +209,7 @@ class SceneClients:
 
 
 def _now(client: viser.ClientHandle) -> Standpoint:
-    """Where a client looks from."""
+    """Return the present camera of a client."""
     c = client.camera
     position, look_at, up = (
         (float(v[0]), float(v[1]), float(v[2])) for v in (c.position, c.look_at, c.up_direction)

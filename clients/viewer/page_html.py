@@ -10,12 +10,12 @@ from flexdt.clients.viewer.scenes.layers import LAYERS, Layer
 
 PAGE: Final = "index.html"
 TRANSLUCENT: Final = "translucent.js"
-"""What every scene of viser loads first, on the page and exported."""
+"""First script of every scene of viser, on the page and exported."""
 TOKEN_FORM: Final = "token.html"
 WRONG: Final = "<!-- wrong -->"
-"""Where the form says that a token was wrong."""
+"""Place of the form's message about a wrong token."""
 PLACE: Final = "<!-- a box for each layer -->"
-"""Where the boxes stand."""
+"""Place of the boxes."""
 
 
 def page_file(name: str) -> bytes:
@@ -29,10 +29,10 @@ def page_file(name: str) -> bytes:
 
 
 def token_form(wrong: bool) -> bytes:
-    """Make the page that asks for the viewer's token.
+    """Make the page with the form for the viewer's token.
 
     Args:
-        wrong: whether one was given that is not it.
+        wrong: whether a wrong one was given.
     """
     said = b'<p id="wrong" role="alert">This is not it.</p>' if wrong else b""
     return page_file(TOKEN_FORM).replace(WRONG.encode(), said, 1)

@@ -1,4 +1,5 @@
-"""Messages that a page's scenes may send to viser, each validated field by field and encoded anew.
+"""Messages that a page's scenes may send to viser, each validated field by field and
+encoded again.
 
 Only the kinds of a list get through (`ALLOWED`), by viser's names for them.
 """
@@ -17,9 +18,9 @@ from flexdt.protocol.fields import Params
 from flexdt.runtime.log import log
 
 LARGEST_SIDE: Final = 4096
-"""Of a picture of a view [px]."""
+"""Largest side of a picture of a view [px]."""
 MAX_SMALL: Final = 4096
-"""Bytes of any message but a picture."""
+"""Largest size of any message but a picture [bytes]."""
 SHOWN: Final = 40
 Length = Annotated[float, Ge(-1e6), Le(1e6)]
 Part = Annotated[float, Ge(-2), Le(2)]
@@ -78,7 +79,7 @@ ALLOWED: Final[dict[str, type[Params]]] = {
         GetRenderResponseMessage,
     )
 }
-"""What a page's scenes send, by viser's names for it, each checked field by field."""
+"""Allowed messages of a page's scenes, by viser's names, each checked field by field."""
 
 
 class Unwanted(ValueError):
@@ -86,10 +87,13 @@ class Unwanted(ValueError):
 
 
 def admitted(raw: str | bytes) -> bytes:
-    """A page's message, validated and encoded anew for viser.
+    """Validate a page's message and encode it again for viser.
+
+    Args:
+        raw: as received.
 
     Raises:
-        Unwanted: says what is wrong.
+        Unwanted: another kind, too long, or a wrong field; names it.
     """
     if isinstance(raw, str):
         raise Unwanted("text")
@@ -114,7 +118,8 @@ def admitted(raw: str | bytes) -> bytes:
 
 
 def _small_picture(data: bytes) -> bool:
-    """Whether a PNG's header states a small size; empty bytes report a failure and pass."""
+    """Check that a PNG's header states a small size; empty bytes report a failure and
+    pass."""
     if not data:
         return True
     if len(data) < 24 or not data.startswith(b"\x89PNG\r\n\x1a\n") or data[12:16] != b"IHDR":
@@ -136,7 +141,7 @@ class MessageFilter:
         self._logged: set[str] = set()
 
     def admit(self, raw: str | bytes) -> bytes | None:
-        """The message as it goes to viser, or None to drop it."""
+        """Validate a message for viser; None drops it, and its problem is logged once."""
         try:
             return admitted(raw)
         except Unwanted as error:

@@ -73,9 +73,10 @@ from flexdt.twin.script.scan_request import Kind as KindOfScan
 from flexdt.twin.script.scan_request import ScanRequest
 
 APART: Final = 0.01
-"""Of two positions that are not the same [mm, deg]."""
+"""Least difference of two positions that are not the same [mm, deg]."""
 MAX_SHARED: Final = 2
-"""Pictures and exports under way at a time, for all pages: each may take hundreds of megabytes."""
+"""Largest number of pictures and exports at a time, for all pages: each may take
+hundreds of megabytes."""
 Kind = Literal["line_integral", "counts"]
 View = Literal["iso", "beam", "side", "free"]
 Grey = Annotated[float, Ge(-1e6), Le(1e6)]
@@ -171,12 +172,12 @@ class Live(Params):
     name: FileName | None = None
     side: Literal[128, 192, 256, 512] = 128
     past: bool = False
-    """The whole volume of a scan that was made, not one that grows."""
+    """Request the complete volume of a finished scan, not a growing one."""
 
 
 class Block(Live):
-    """Which of its volumes: the one that was asked for, its noise, a bound of its bias, its
-    sample's truth, how far they are apart, or the one with the other geometry."""
+    """Kind of volume: the reconstructed one, its noise, a bound of its bias, its
+    sample's truth, their difference, or the one with the other geometry."""
 
     what: Literal["volume", "sigma", "bias_bound", "truth", "difference", "other"] = "volume"
 
@@ -196,7 +197,7 @@ class Compose(Params):
     kV: Voltage | None = None
     power_W: Power | None = None
     voxel_um: Annotated[float, Ge(0.01), Le(1e6)] | None = None
-    """Of the finest details at the axis; none: the distances stay."""
+    """Size of the finest details at the axis [um]; None keeps the distances."""
     keep: Annotated[list[AxisName], Len(0, 64)] = Field(default_factory=list)
 
 
@@ -245,7 +246,7 @@ async def layers(viewer: Viewer, page: Page, params: Params) -> object:
 
 
 async def theme(viewer: Viewer, page: Page, params: Theme) -> object:
-    """Light or dark, plain or fine, for this page's scenes."""
+    """Set light or dark, plain or fine, for this page's scenes."""
     page.dark = params.dark
     viewer.clients.theme(page.id, page.dark, params.fine)
     return {}
@@ -261,13 +262,14 @@ async def camera(viewer: Viewer, page: Page, params: Camera) -> object:
 
 
 async def preset(viewer: Viewer, page: Page, params: Preset) -> object:
-    """Say where the camera of a view opens in a pane of this page; empty where nobody knows."""
+    """Return the first camera of a view in a pane of this page; empty where it is not
+    known."""
     fitted = viewer.clients.cameras.get(params.view)
     return {} if fitted is None else asdict(fitted.at(params.aspect))
 
 
 async def feed(viewer: Viewer, page: Page, params: Feed) -> object:
-    """Which images this page wants: line_integral or counts."""
+    """Set the kind of images that this page wants: line_integral or counts."""
     page.kind = params.kind
     viewer.refresh_feeds()
     return {}
@@ -282,7 +284,7 @@ async def window(viewer: Viewer, page: Page, params: Window) -> object:
 
 
 async def ray(viewer: Viewer, page: Page, params: Ray) -> object:
-    """Show this page the ray of a pixel; what it goes through."""
+    """Show this page the ray of a pixel; returns its path lengths through materials."""
     lab, world = _lab(viewer), viewer.world
     clients = viewer.clients.of(page.id)
     if params.pixel is None or world is None:
@@ -295,8 +297,11 @@ async def ray(viewer: Viewer, page: Page, params: Ray) -> object:
 
 
 async def spectrum(viewer: Viewer, page: Page, params: Spectrum) -> object:
-    """Photons by energy at a voltage, behind the filters of the machine's tube; what tube and
-    camera allow."""
+    """Compute the tube's spectrum behind the machine's filters at a voltage.
+
+    Returns:
+        `energy_keV`, `photons`, `mean_keV`, `filters`, and `limits` of tube and camera.
+    """
     machine = _lab(viewer).machine
     tube, lit, panel = tube_of(machine.tube), machine.tube, machine.detector
     behind = tube_spectrum(params.kV, tube)
@@ -315,7 +320,15 @@ async def spectrum(viewer: Viewer, page: Page, params: Spectrum) -> object:
 
 
 async def plan(viewer: Viewer, page: Page, params: Plan) -> object:
-    """Plan a script to scrub through; none: forget the plan and what this page shows of it."""
+    """Plan a script to scrub through; None removes the plan and its drawing from this
+    page.
+
+    Returns:
+        The time line, see `scrubbed_plan.document`.
+
+    Raises:
+        RpcError: a data set is open on this page.
+    """
     lab, text = _lab(viewer), params.text
     if page.recorded is not None:
         raise RpcError(Code.BUSY, "a data set is open: close it to scrub a plan")
@@ -334,7 +347,12 @@ async def plan(viewer: Viewer, page: Page, params: Plan) -> object:
 
 
 async def recorded(viewer: Viewer, page: Page, params: Recorded) -> object:
-    """Show this page the images of a data set instead of live ones; none: live ones again."""
+    """Show this page the images of a data set instead of live ones; None shows live ones
+    again.
+
+    Returns:
+        The result of `dataset.get`; empty for None.
+    """
     lab, name = _lab(viewer), params.name
     clients = viewer.clients.of(page.id)
     told: Any = None
@@ -356,7 +374,15 @@ async def recorded(viewer: Viewer, page: Page, params: Recorded) -> object:
 
 
 async def recorded_image(viewer: Viewer, page: Page, params: RecordedImage) -> object:
-    """Show this page an image of its data set, and in its scenes the machine as it stood then."""
+    """Show this page an image of its data set, and in its scenes the machine at that
+    moment.
+
+    Returns:
+        The image's entries, `geometry`, `tube` and `problem` of the virtual image.
+
+    Raises:
+        RpcError: no data set is open, or another one was opened meanwhile.
+    """
     lab, name = _lab(viewer), page.recorded
     if name is None:
         raise RpcError(Code.INVALID_PARAMS, "open a data set first: there is nothing to show")
@@ -394,7 +420,8 @@ async def recorded_image(viewer: Viewer, page: Page, params: RecordedImage) -> o
 
 
 def _readout(cone: Sequence[float], shape: tuple[int, ...]) -> Mapping[str, object] | None:
-    """What follows from the nominal geometry of a recorded image; None: nothing is known of it."""
+    """Compute distances and sizes of a recorded image's nominal geometry; None: it is
+    not known."""
     if not cone:
         return None
     view = ConeVec(np.array([cone]))
@@ -404,17 +431,18 @@ def _readout(cone: Sequence[float], shape: tuple[int, ...]) -> Mapping[str, obje
 
 
 async def _virtual(page: Page, told: Mapping[str, Any]) -> tuple[Any, Any]:
-    """The image that the twin predicts where one of a data set was taken, as it was exposed, and
-    what it is made of."""
+    """Predict the virtual image at a recorded one's pose and exposure; returns its
+    origin as well."""
     asked = {name: told[name] for name in ("kind", "positions")}
-    for what in ("tube", "camera"):  # what is not known of it is as it is now
+    for what in ("tube", "camera"):  # unknown settings are the present ones
         asked[what] = {k: v for k, v in told[what].items() if v is not None}
     answer: Any = await page.link.request("projection.get", asked)
     return wire_image.decode(answer), answer.get("origin")
 
 
 async def live(viewer: Viewer, page: Page, params: Live) -> object:
-    """Grow a volume of a data set from the images so far, for all pages that want one."""
+    """Start to grow a volume of a data set from the images so far, for all pages that
+    want one."""
     page.live = params.name is not None
     if params.name is None:
         viewer.ungrow()
@@ -427,13 +455,14 @@ async def live(viewer: Viewer, page: Page, params: Live) -> object:
 
 
 async def _of_volume(viewer: Viewer, params: Live, *words: str) -> tuple[Any, bytes]:
-    """What the volume's process answers; nothing where it has another volume by now."""
+    """Send a request to the volume's process; returns nothing where it has another
+    volume by now."""
     folder = _data(viewer) / plain_name(params.name or "", "data set")
     return await viewer.grower.ask(wish(folder, params.side, params.past), *words) or ({}, b"")
 
 
 async def volume_block(viewer: Viewer, page: Page, params: Block) -> object:
-    """A volume that is reconstructed as a page draws it: a head, and codes to fetch; empty while
+    """Offer a reconstructed volume to a page: a head, and codes to fetch; empty while
     there is none."""
     head, codes = await _of_volume(viewer, params, "block", params.what)
     if not codes:
@@ -445,7 +474,8 @@ async def volume_block(viewer: Viewer, page: Page, params: Block) -> object:
 
 
 async def voxel(viewer: Viewer, page: Page, params: Voxel) -> object:
-    """Exact values of a voxel by the names of the volumes there are; None where no data cover."""
+    """Read exact values of a voxel by the names of the volumes; None where no data
+    cover."""
     return (await _of_volume(viewer, params, "voxel", *map(str, params.at)))[0]
 
 
@@ -457,7 +487,11 @@ async def volume_compare(viewer: Viewer, page: Page, params: Live) -> object:
 
 
 async def compose(viewer: Viewer, page: Page, params: Compose) -> object:
-    """Compose a script for the requested scan in the present geometry."""
+    """Compose a script for the requested scan in the present geometry.
+
+    Returns:
+        `text`, and `moved`: axis -> its present position and the script's.
+    """
     lab, state = _lab(viewer), viewer.state
     request = ScanRequest(kind=params.kind, frames=params.frames, exposure_ms=params.exposure_ms)
     if state is not None:
@@ -485,8 +519,13 @@ async def compose(viewer: Viewer, page: Page, params: Compose) -> object:
 
 
 def _moved(text: str, lab: LabScene, state: State) -> dict[str, tuple[float, float]]:
-    """Axis -> (where it stands, where a script's projections have it), for axes that stand neither
-    there nor at home; axes that the script moves between projections are its own."""
+    """Compare a script's poses with the present ones.
+
+    Returns:
+        Axis -> (present position, that of the script's projections), for axes that are
+        neither
+        there nor at home; axes that the script moves between projections are left out.
+    """
     plan = plans.plan_text(text, lab.machine, lab.profile, state)
     stands, found = motors(lab.machine, state), {}
     for axis, there in plans.projection_positions(plan).items():
@@ -499,7 +538,7 @@ def _moved(text: str, lab: LabScene, state: State) -> dict[str, tuple[float, flo
 
 
 async def datasets(viewer: Viewer, page: Page, params: Datasets) -> object:
-    """Data sets, newest first, with thumbnails."""
+    """List data sets, newest first, with thumbnails."""
     asked = {"search": params.search, "start": params.start, "thumbnail": 96}
     told: Any = await page.link.request("dataset.list", asked)
     for info in told["datasets"]:
@@ -523,7 +562,7 @@ async def estimate(viewer: Viewer, page: Page, params: CalibrationFit | Calibrat
 
 
 async def correct(viewer: Viewer, page: Page, params: Correct) -> object:
-    """A correction for the twin."""
+    """Send a correction to the twin."""
     return await page.link.request("calibration.apply", params.model_dump(exclude_none=True))
 
 
@@ -541,7 +580,7 @@ async def scrub(viewer: Viewer, page: Page, params: Scrub) -> object:
 
 
 async def screenshot(viewer: Viewer, page: Page, params: Screenshot) -> object:
-    """A picture of one of this page's views, as a download."""
+    """Take a picture of one of this page's views, as a download."""
     clients = viewer.clients.of(page.id, params.view)
     if not clients:
         raise RpcError(Code.INVALID_PARAMS, f"the view {params.view!r} is not open")
@@ -553,7 +592,14 @@ async def screenshot(viewer: Viewer, page: Page, params: Screenshot) -> object:
 
 
 async def export(viewer: Viewer, page: Page, params: Export) -> object:
-    """The scene, or a replay of this page's plan, as one file: html or viser."""
+    """Export the scene, or a replay of this page's plan, as one file: html or viser.
+
+    Returns:
+        The download's `url` and name.
+
+    Raises:
+        RpcError: there is no plan to replay, or too many exports are running.
+    """
     lab, form = _lab(viewer), params.format
     if not params.replay:
         seen = next(iter(viewer.clients.of(page.id, "free") or viewer.clients.of(page.id)), None)
@@ -638,7 +684,7 @@ METHODS: Mapping[str, tuple[type[Params], Answer]] = {
     "viewer.screenshot": (Screenshot, screenshot),
     "viewer.export": (Export, export),
 }
-"""Method -> its parameters, and what answers it."""
+"""Method -> its parameters, and its function."""
 
 
 async def serve(name: str, viewer: Viewer, page: Page, given: Mapping[str, Any]) -> object:
@@ -655,4 +701,4 @@ async def serve(name: str, viewer: Viewer, page: Page, given: Mapping[str, Any])
 
 
 ANSWERS: Mapping[str, PageMethod] = {name: partial(serve, name) for name in METHODS}
-"""What a viewer answers to its pages."""
+"""Methods of a viewer for its pages."""

@@ -31,7 +31,8 @@ MAX_STEPS = 4000
 CURVE_POINTS = 400
 ORBIT_POINTS = 720
 MAX_IMAGES = 1_000_000
-"""Most images of a plan to scrub: the moment of each is kept while a page shows the plan."""
+"""Largest number of images of a plan to scrub: the moment of each is kept while a page
+shows it."""
 PLANNERS = 1
 PLAN_BYTES = 2 << 30
 PLAN_S = 20.0
@@ -46,8 +47,8 @@ class RecordedPositions:
 
     @classmethod
     def of(cls, told: Mapping[str, Any]) -> RecordedPositions | None:
-        """Of what `dataset.get` tells; None where poses are not known. Images without times are a
-        second apart."""
+        """Build from a result of `dataset.get`; None where poses are not known. Images
+        without times are a second apart."""
         motors = {n: np.array(values, dtype=float) for n, values in told["positions"].items()}
         if not motors:
             return None
@@ -62,16 +63,17 @@ class RecordedPositions:
         return float(self.times[-1])
 
     def positions(self, times: FloatArray) -> dict[str, FloatArray]:
-        """Motor positions at `times` [s of the scan's clock], same shape."""
+        """Compute motor positions at `times` [s of the scan's clock], same shape."""
         return {n: np.interp(times, self.times, v) for n, v in self.motors.items()}
 
 
 Scrubbed = ScanPlan | RecordedPositions
-"""What a page may scrub through."""
+"""Plan or recorded positions for a page to scrub through."""
 
 
 def positions_at(scrubbed: Scrubbed, time: float) -> dict[str, float]:
-    """Motor positions at `time` [s]; before the start and after the end as there."""
+    """Compute motor positions at `time` [s]; the first ones before the start, the last
+    after the end."""
     at = np.clip([time], 0.0, scrubbed.duration_s)
     return {name: float(values[0]) for name, values in scrubbed.positions(at).items()}
 
@@ -102,7 +104,7 @@ async def make(
 
 
 def work(parts: Sequence[bytes]) -> list[bytes]:
-    """In a worker process: what `make` sent."""
+    """Run a plan in a worker process, from the message of `make`."""
     return [pickle.dumps(_made(*pickle.loads(parts[0])))]
 
 
@@ -130,7 +132,16 @@ def plan_text(text: str, machine: Machine, profile: Profile, state: State | None
 
 
 def document(plan: ScanPlan) -> dict[str, Any]:
-    """What a page needs to draw the timeline."""
+    """Make the data of a page's time line.
+
+    Args:
+        plan: of the script.
+
+    Returns:
+        `duration_s`, `frames`, `bytes`, `times`, `curves` of moving axes, `images`,
+        `steps` and
+        `problems`.
+    """
     times = np.linspace(0.0, plan.duration_s, CURVE_POINTS)
     curves = plan.positions(times)
     moving = {
@@ -156,7 +167,7 @@ def document(plan: ScanPlan) -> dict[str, Any]:
 
 
 def projection_positions(plan: ScanPlan) -> dict[str, FloatArray]:
-    """Axis -> (n,) positions at the projections of a plan."""
+    """Return axis -> (n,) positions at the projections of a plan."""
     kinds = [group.kind for group in plan.groups for _ in range(len(group))]
     taken = np.array(kinds, dtype=str) == "projection"
     return {name: values[taken] for name, values in plan.image_positions.items()}
@@ -165,7 +176,8 @@ def projection_positions(plan: ScanPlan) -> dict[str, FloatArray]:
 def source_path(
     at: Mapping[str, FloatArray], machine: Machine, profile: Profile, state: State
 ) -> FloatArray:
-    """The focal spot as the sample sees it for motor positions (n,) [mm, deg], (n, 3) [mm]."""
+    """Compute the focal spot in the sample's frame (n, 3) [mm], for motor positions
+    (n,) [mm, deg]."""
     count = len(next(iter(at.values()), ()))
     if not count:
         return np.zeros((0, 3))

@@ -23,7 +23,7 @@ AIR: Final = 0.05
 """Line integral below which a pixel counts as air."""
 TOP: Final = 65535
 JPEG_QUALITY: Final = 85
-"""Of images in motion; 20 to 50 kB each."""
+"""Quality of images in motion; 20 to 50 kB each."""
 DEFLATE_LEVEL: Final = 1
 
 
@@ -37,9 +37,9 @@ class ShownImage:
         cone_vec: its geometry, twelve numbers.
         time: of the pose [s of the twin's clock].
         seq: the event's number.
-        flags: what the twin says of it; None of a recorded one.
+        flags: the twin's marks of it; None of a recorded one.
         virtual: to compare it with, of the same shape and kind; None for none.
-        origin: what the twin made it of (`ImageOrigin` of the wire); None of a recorded one.
+        origin: how the twin made it (`ImageOrigin` of the wire); None of a recorded one.
         twin: run of the twin that made it; "" where that is not known.
     """
 
@@ -55,7 +55,8 @@ class ShownImage:
 
 
 def window_of(image: ShownImage) -> tuple[float, float]:
-    """A window [low, high] of all but the densest 2 % of what is not air: beads do not set it."""
+    """Choose a window [low, high] of all matter but the densest 2 %: beads do not set
+    it."""
     pixels = np.asarray(image.pixels[::4, ::4], dtype=np.float32)
     if pixels.size == 0:
         return 0.0, 1.0
@@ -68,7 +69,8 @@ def window_of(image: ShownImage) -> tuple[float, float]:
 
 
 def grey(image: ShownImage, window: tuple[float, float]) -> npt.NDArray[np.uint8]:
-    """8-bit RGB (rows, cols, 3); line integrals are drawn as a film: matter bright on black."""
+    """Convert to 8-bit RGB (rows, cols, 3); line integrals are drawn as a film: matter
+    bright on black."""
     low, high = window
     scaled = (np.asarray(image.pixels, dtype=np.float32) - low) * (255.0 / (high - low))
     byte = np.nan_to_num(np.clip(scaled, 0.0, 255.0)).astype(np.uint8)
@@ -82,14 +84,15 @@ def packed(
     beads: Sequence[Sequence[float]],
     facts: Mapping[str, object],
 ) -> bytes:
-    """An image for a page: magic, length of the header, header (JSON), pixels.
+    """Encode an image for a page: magic, length of the header, header (JSON), pixels.
 
-    Pixels are uint16 with a scale. Exact ones are the differences from column to column (mod 2^16),
-    first the low bytes of all, then the high ones, deflated (zlib). Coarse ones are a grey JPEG of
-    their high bytes. The rows of a virtual image follow those of an exact one.
+    Pixels are uint16 with a scale. Exact ones are the differences from column to column
+    (mod 2^16), first the low bytes of all, then the high ones, deflated (zlib). Coarse
+    ones are a grey JPEG of their high bytes. The rows of a virtual image follow those of
+    an exact one.
 
     Args:
-        image: what to send.
+        image: to send.
         coarse: send the mean over 2 x 2 pixels instead, as a JPEG.
         beads: predicted bead centres (column, row) in pixels of the full image.
         facts: more entries of the header.

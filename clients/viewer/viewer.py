@@ -1,8 +1,8 @@
 """The viewer as one asyncio program: the twin's states in, scenes and pages out.
 
-Owns the link to the twin, the viser server, the pages and what they share. Drawing happens at most
-30 times a second, always of the newest state. Commands do not pass through here: each goes out over
-its page's own connection.
+Owns the link to the twin, the viser server, the pages and their shared data. Drawing
+happens at most 30 times a second, always of the newest state. Commands do not pass
+through here: each goes out over its page's own connection.
 """
 
 from __future__ import annotations
@@ -51,25 +51,28 @@ from flexdt.twin.machine.description import Machine, Profile, builtin_machine, p
 
 DRAW_HZ: Final = 30.0
 ASKED_HZ: Final = 36.0
-"""States asked of the twin a second: a little more, since those that come late are dropped."""
+"""Rate of states requested of the twin [1/s]: slightly more, since late ones are
+dropped."""
 NAMES_S: Final = 0.25
 BEAT_S: Final = 0.25
-"""Between heartbeats to the pages."""
+"""Interval between heartbeats to the pages [s]."""
 QUIET_S: Final = 0.5
-"""A twin that has sent nothing for this long is asked for its state; at rest it sends none."""
+"""Time without a message after which the twin's state is requested [s]; at rest it
+sends none."""
 SCENES_A_PAGE: Final = 8
-"""Four views, and those that are just being closed."""
+"""Largest number of views of a page: four, and those that are just being closed."""
 STILL_S: Final = 5.0
-"""How long a picture of the scene waits for the twin's first state."""
+"""Longest wait of a picture of the scene for the twin's first state [s]."""
 CLOSE_MM: Final = 20.0
-"""Clearance below which the page warns."""
+"""Clearance below which the page warns [mm]."""
 
 PageMethod = Callable[["Viewer", Page, Mapping[str, Any]], Awaitable[object]]
 """Answers one request of a page from its raw parameters."""
 
 
 def nearest(safety: SafetyState) -> dict[str, Any]:
-    """The nearest parts that may not touch, for pages; `close` where that is worth a warning."""
+    """Return the nearest parts that may not touch, for pages; `close` where a warning
+    is due."""
     mm = safety.clearance_mm
     return {"mm": mm, "pair": safety.pair or [], "close": mm is not None and mm < CLOSE_MM}
 
@@ -81,9 +84,9 @@ class Viewer:
         address: of the twin.
         answers: the viewer's own methods by name.
         machine, profile: instead of the ones the twin names (for files).
-        token: browsers must show; None for none.
+        token: required of browsers; None for none.
         data: the twin's data directory where it can be read, for slices of running scans.
-        limits: what all pages together may cost.
+        limits: for all pages together.
         looks: part of `machine` -> its own mesh.
 
     Attributes:
@@ -102,6 +105,8 @@ class Viewer:
         limits: ViewerLimits | None = None,
         looks: Mapping[str, bytes] | None = None,
     ) -> None:
+        """Prepare link, feeds, viser's server and the pages' state; `start` listens.
+        See the class."""
         self.twin_address, self._token = address, token
         self._machine, self._profile, self.looks = machine, profile, looks
         self.data, self.limits = data, limits or ViewerLimits()
@@ -149,7 +154,11 @@ class Viewer:
         self._loop: asyncio.AbstractEventLoop | None = None
 
     async def start(self, host: str, port: int, ssl: Any = None) -> None:
-        """Listen and begin to work.
+        """Start to listen and to work.
+
+        Args:
+            host, port: to listen on.
+            ssl: a server's TLS context; None for plain TCP.
 
         Raises:
             AccessError: others can reach the address and there is no token.
@@ -186,6 +195,13 @@ class Viewer:
     # -- the twin ----------------------------------------------------------------------------
 
     def _event(self, topic: str, params: Mapping[str, object]) -> None:
+        """Take an event of the twin: a state to draw, or a job or log entry to pass to
+        all pages.
+
+        Args:
+            topic: of the event.
+            params: data and number of the event.
+        """
         self._heard_at = time.monotonic()
         data = params.get("data")
         if not isinstance(data, Mapping):
@@ -212,7 +228,7 @@ class Viewer:
         self._due.set()
 
     async def _ask(self) -> None:
-        """Ask a twin that says nothing: it is at rest, or it hangs."""
+        """Get the state of a twin that sends nothing: it is at rest, or it hangs."""
         while True:
             await asyncio.sleep(max(0.05, self._heard_at + QUIET_S - time.monotonic()))
             if not self.link.connected or time.monotonic() - self._heard_at < QUIET_S:
@@ -226,7 +242,7 @@ class Viewer:
             self._heard_at = time.monotonic()
 
     async def _beat(self) -> None:
-        """Tell the pages how old what they show is: what hangs does not say so itself."""
+        """Send the pages the age of the state: a hanging twin does not report it."""
         while True:
             now = time.monotonic()
             beat = json.dumps({"type": "beat", "at": now, "silent_s": now - self._heard_at})
@@ -235,9 +251,11 @@ class Viewer:
             await asyncio.sleep(BEAT_S)
 
     async def _name(self) -> None:
-        """Keep names where they have room in each view, whatever moves: cameras do it unasked.
+        """Keep names where they have room in each view, whatever moves: cameras move
+        without an event.
 
-        What has come to rest is in each picture, too, unless a person has chosen another one.
+        Once the machine is at rest it is in each picture, too, unless a person has chosen
+        another one.
         """
         before: World | None = None
         while True:
@@ -254,7 +272,8 @@ class Viewer:
                         await asyncio.to_thread(self.tags.draw, client, named)
 
     def show_layers(self) -> None:
-        """Have the frames show what their pages want, as soon as they have got what is built."""
+        """Set the nodes that each page shows in its frames, as soon as they have
+        received all nodes."""
         if (lab := self.lab) is None:
             return
         for page in self.pages.values():
@@ -262,7 +281,7 @@ class Viewer:
             self.clients.show(page.id, nodes, lab.plain, self._built)
 
     def _shown_by(self, id: str) -> Shown:
-        """What a page shows, or the usual things where it has not said who it is."""
+        """Return the layers shown by a page, or the default ones for an unknown page."""
         page = self.pages.get(id)
         return Shown() if page is None else page.shown
 
@@ -285,6 +304,7 @@ class Viewer:
     # -- drawing -----------------------------------------------------------------------------
 
     async def _draw(self) -> None:
+        """Draw the newest state, at most `DRAW_HZ` times a second, for ever."""
         loop, sound = asyncio.get_running_loop(), True
         while True:
             await self._due.wait()
@@ -303,6 +323,13 @@ class Viewer:
             await asyncio.sleep(max(0.0, begun + 0.8 / DRAW_HZ - loop.time()))
 
     async def _take_state(self, raw: Mapping[str, Any]) -> None:
+        """Draw a state: sample, cameras, scene and pages.
+
+        A new machine or sample is built first; the first state starts the images.
+
+        Args:
+            raw: the state as the twin sends it.
+        """
         state = State.model_validate(raw)
         before = self.lab
         lab = await self._ready_lab()
@@ -381,7 +408,13 @@ class Viewer:
             await self._dress(lab, self.state)
 
     def _image(self, image: ShownImage, coarse: bool) -> None:
-        """In a worker thread: one image to the panel and to the pages that want its kind."""
+        """Show one image on the panel and send it to the pages that want its kind; in a
+        worker thread.
+
+        Args:
+            image: to show.
+            coarse: at half the resolution, while images follow each other.
+        """
         lab, world, look = self.lab, self.world, self.look
         if lab is None or world is None:
             return
@@ -407,7 +440,8 @@ class Viewer:
                 page.show("image", content)
 
     async def still(self, asked: Mapping[str, str]) -> bytes | None:
-        """The scene as it stands, as a JPEG (see `Stills`); None: nothing is known of this view."""
+        """Draw the present scene as a JPEG (see `Stills`); None: the view is not
+        known."""
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(self._placed.wait(), STILL_S)
         lab, world = self.lab, self.world
@@ -439,6 +473,12 @@ class Viewer:
     # -- pages -------------------------------------------------------------------------------
 
     async def _page(self, id: str, connection: ServerConnection) -> None:
+        """Serve a page until it ends, or reject it where too many are open.
+
+        Args:
+            id: of the page.
+            connection: to its browser.
+        """
         if len(self.open_pages) >= self.limits.max_pages:
             reason = f"it serves {self.limits.max_pages} pages at most, and so many are open"
             log("a page was refused", logging.WARNING, page=id, reason=reason)
@@ -480,13 +520,13 @@ class Viewer:
                 feed.stop()
 
     def _joined(self, client: viser.ClientHandle, id: str) -> None:
-        """In one of viser's threads: a page opens a view, which shows its plan's path, too."""
+        """Draw a page's plan path in its new view; called in one of viser's threads."""
         page, lab = self.pages.get(id), self.lab
         if page is not None and page.orbit is not None and lab is not None:
             lab.plan.orbit([client], page.orbit)
 
     def _dragged(self, client: int | None, targets: Mapping[str, float]) -> None:
-        """Pass a drag of a stage on to its page; called in one of viser's threads."""
+        """Send a drag of a stage on to its page; called in one of viser's threads."""
         page = self.pages.get(self.clients.page_of(client) or "")
         if page is not None and self._loop is not None:
             self._loop.call_soon_threadsafe(page.drag, dict(targets))

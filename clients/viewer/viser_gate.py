@@ -42,10 +42,11 @@ from flexdt.clients.viewer.scenes.views import Standpoint
 
 MAX_OF_VISER: Final = 256 << 20
 LONGEST_TMP: Final = 70
-"""Bytes of the folder for temporary files; a socket's path has at most about a hundred."""
+"""Longest path of the folder for temporary files [bytes]; a socket's has at most about
+a hundred."""
 PREFIX: Final = "flexdt-viser-"
 YOUNG_S: Final = 60.0
-"""A younger folder may belong to a viewer that does not listen yet."""
+"""Age below which a folder may belong to a viewer that does not listen yet [s]."""
 MARK: Final = b"<!-- program -->"
 _one_at_a_time = threading.Lock()
 
@@ -63,6 +64,12 @@ class Scenes:
     """
 
     def __init__(self, label: str | None = None) -> None:
+        """Start viser's server on a Unix socket in a private folder, without its ways to
+        the outside.
+
+        Args:
+            label: of the server.
+        """
         usual = tempfile.gettempdir()
         short = usual if len(usual.encode()) <= LONGEST_TMP else "/tmp"
         clear_left_behind(Path(short))
@@ -71,7 +78,7 @@ class Scenes:
         try:
             with _listening_at(self.path), redirect_stdout(io.StringIO()):  # its banner
                 self.server = viser.ViserServer(host="127.0.0.1", port=0, label=label)
-            # Nothing that a page or a button of viser's says opens a way in from outside.
+            # No request of a page or a button of viser's opens a way in from outside.
             for message in (ShareUrlRequest, ShareUrlDisconnect):
                 self.server._websock_server.unregister_handler(message)
         except BaseException:
@@ -79,7 +86,7 @@ class Scenes:
             raise
 
     def html(self) -> bytes:
-        """viser's page."""
+        """Read viser's page."""
         return (Path(viser.__file__).parent / "client" / "build" / "index.html").read_bytes()
 
     @asynccontextmanager
@@ -97,19 +104,21 @@ class Scenes:
             yield connection
 
     def path_of(self, client_id: int) -> str | None:
-        """The path of a client's connection; None when it has closed."""
+        """Return the path of a client's connection; None when it has closed."""
         connection = self.server._websock_server._live_connections.get(client_id)
         request = None if connection is None else connection.request
         return None if request is None else str(request.path.partition("?")[0])
 
     @property
     def said(self) -> int:
-        """How much has been said to all clients so far."""
+        """Number of messages sent to all clients so far."""
         return self.server._websock_server._broadcast_buffer.message_counter
 
     def heard(self, client_id: int, said: int) -> bool:
-        """Whether a client has been sent all that had been said to everybody by then. What is said
-        to it alone has a queue of its own, and could overtake that."""
+        """Check that a client has been sent the first `said` messages to all clients.
+
+        Messages to it alone have a queue of their own, and could overtake those.
+        """
         at = self.server._websock_server._broadcast_buffer.generator_cursors.get(client_id, -1)
         return at >= said - 1
 
@@ -148,9 +157,9 @@ def _changes(nodes: Nodes) -> Iterator[Message]:
 
 
 def look_from(serializer: Any, camera: Standpoint, nodes: Nodes) -> None:
-    """Set the first camera of a recorded scene, and what is shown of it.
+    """Set the first camera of a recorded scene, and its shown nodes.
 
-    `server.initial_camera` would say it too, but also overrule the cameras of pages that come.
+    `server.initial_camera` would do so too, but also override the cameras of later pages.
     """
     serializer._insert_message(SetCameraPositionMessage(camera.position, initial=True))
     serializer._insert_message(SetCameraLookAtMessage(camera.look_at, initial=True))
@@ -159,10 +168,10 @@ def look_from(serializer: Any, camera: Standpoint, nodes: Nodes) -> None:
 
 
 def parted(html: bytes) -> tuple[bytes, bytes]:
-    """viser's page with MARK for its program, and the program as a script of its own.
+    """Split viser's page into the page with MARK and its program as a script of its own.
 
-    The program is nearly all of the page, and the same for every view: as a file under one name
-    a browser fetches it once. A page that is built otherwise stays whole.
+    The program is nearly all of the page, and the same for every view: as a file under
+    one name a browser fetches it once. A page that is built otherwise is not split.
     """
     match = re.search(rb"<script((?: data-[a-z]+=\"[^\"]*\")+)>(.*?)</script>", html, re.DOTALL)
     if match is None:
@@ -174,7 +183,14 @@ def parted(html: bytes) -> tuple[bytes, bytes]:
 
 @contextlib.contextmanager
 def _listening_at(path: Path) -> Iterator[None]:
-    """While it lasts, a server that viser starts listens there and nowhere else."""
+    """Make a server that viser starts meanwhile listen at a path and nowhere else.
+
+    Args:
+        path: of the Unix socket.
+
+    Raises:
+        GateError: viser starts its server in another way.
+    """
     listener = socket.socket(socket.AF_UNIX)
     serve, used = library.serve, False
 

@@ -1,7 +1,7 @@
 """Background tasks that are watched.
 
-asyncio keeps a task's exception until somebody awaits the task: a failure of a watched one is
-logged, reported to whoever depends on the task, and not followed by a restart.
+asyncio keeps a task's exception until the task is awaited: a failure of a watched one is
+logged, reported to the owner of the task, and not followed by a restart.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def watched(
 
     Args:
         work: the coroutine.
-        what: it does, for the log.
+        what: name of the work, for the log.
         died: called when it has failed.
     """
 
