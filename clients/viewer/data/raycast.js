@@ -40,35 +40,65 @@ void main() {
   }
   if (most == 1) color = vec4(vec3(clamp((found - grey.x) * grey.y, 0., 1.)), 1.);
 }`;
-export function raycast(canvas, side = 0) {
-    const glass = document.createElement("canvas"), gl = glass.getContext("webgl2", { antialias: false, alpha: true, premultipliedAlpha: false, preserveDrawingBuffer: true });
-    if (!gl)
-        return "this browser has no WebGL 2: slices only";
-    const info = gl.getExtension("WEBGL_debug_renderer_info"), software = /swiftshader|llvmpipe|software/i.test(String(info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : ""));
-    const largest = side || (software ? 128 : 256), program = gl.createProgram();
+const NO_WEBGL = "This browser has no WebGL 2, so the volume is not drawn in three dimensions. Slices, "
+    + "histogram, profile and sharing work as usual.";
+const NO_PROGRAM = "This browser's graphics refused to draw the volume in three dimensions, twice. Slices, "
+    + "histogram, profile and sharing work as usual; reloading the page tries again.";
+const LOST = ["The browser's graphics stopped;", "the volume comes back with them.", "Slices work as usual."];
+const REFUSED = ["The browser's graphics refuse", "to draw the volume; reload the page.", "Slices work as usual."];
+const GLASS = {
+    antialias: false, alpha: true, premultipliedAlpha: false, preserveDrawingBuffer: true,
+};
+const TRIES = 2;
+// The program in use, with the triangle that it draws; null where the graphics refuse it.
+function programmed(gl) {
+    const program = gl.createProgram();
     for (const [kind, source] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]]) {
         const shader = gl.createShader(kind);
         if (!shader)
-            return "no shader";
+            return null;
         gl.shaderSource(shader, source);
         gl.compileShader(shader);
         gl.attachShader(program, shader);
     }
     gl.linkProgram(program);
     if (!gl.getProgramParameter(program, gl.LINK_STATUS))
-        return gl.getProgramInfoLog(program) ?? "no shader";
+        return null;
     gl.useProgram(program);
     gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
     gl.bufferData(gl.ARRAY_BUFFER, new Float32Array([-1, -1, 3, -1, -1, 3]), gl.STATIC_DRAW);
     gl.enableVertexAttribArray(0);
     gl.bindAttribLocation(program, 0, "a");
     gl.vertexAttribPointer(gl.getAttribLocation(program, "a"), 2, gl.FLOAT, false, 0, 0);
-    const place = (name) => gl.getUniformLocation(program, name);
-    ["whole", "bricks", "other", "otherBricks"].forEach((name, unit) => { gl.uniform1i(place(name), unit); });
+    ["whole", "bricks", "other", "otherBricks"].forEach((name, unit) => {
+        gl.uniform1i(gl.getUniformLocation(program, name), unit);
+    });
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
-    function texture(unit, [nx, ny, nz], data, filter) {
+    return program;
+}
+// A canvas of its own that draws, or a sentence of why there is none. What refuses the program once
+// is tried again on a fresh canvas; a lost context comes back by itself.
+function glassThatDraws() {
+    for (let left = TRIES; left > 0; left--) {
+        const glass = document.createElement("canvas"), gl = glass.getContext("webgl2", GLASS);
         if (!gl)
-            return;
+            return NO_WEBGL;
+        const program = programmed(gl);
+        if (program || gl.isContextLost())
+            return { glass, gl, program };
+    }
+    return NO_PROGRAM;
+}
+export function raycast(canvas, side = 0) {
+    const found = glassThatDraws();
+    if (typeof found === "string")
+        return found;
+    const { glass, gl } = found;
+    let { program } = found;
+    const info = gl.getExtension("WEBGL_debug_renderer_info"), software = /swiftshader|llvmpipe|software/i.test(String(info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : ""));
+    const largest = side || (software ? 128 : 256);
+    const place = (name) => (program ? gl.getUniformLocation(program, name) : null);
+    function texture(unit, [nx, ny, nz], data, filter) {
         gl.activeTexture(gl.TEXTURE0 + unit);
         gl.deleteTexture(held[unit]);
         gl.bindTexture(gl.TEXTURE_3D, (held[unit] = gl.createTexture()));
@@ -103,7 +133,7 @@ export function raycast(canvas, side = 0) {
         } },
     };
     function fill(b, range, unit) {
-        if (!gl)
+        if (!program || gl.isContextLost())
             return;
         const size = extent(b), f = Math.max(1, Math.ceil(Math.max(...size) / largest)), n = size.map((v) => Math.max(1, Math.floor(v / f)));
         const [lo, hi] = range.map((v) => codeOf(b, v)), data = new Uint8Array(n[0] * n[1] * n[2]), grid = n.map((v) => Math.ceil(v / BRICK)), bricks = new Uint8Array(grid[0] * grid[1] * grid[2]);
@@ -142,14 +172,37 @@ export function raycast(canvas, side = 0) {
         const [c, s, p, q] = [Math.cos(me.yaw), Math.sin(me.yaw), Math.cos(me.pitch), Math.sin(me.pitch)];
         return [[c, s, 0], [-s * q, c * q, p], [-s * p, c * p, -q]]; // right, up, ahead
     };
+    function lost(x, w, h, unit) {
+        x.fillStyle = "#0b0e13";
+        x.fillRect(0, 0, w, h);
+        x.fillStyle = "#8fc8ff";
+        x.font = `${13 * unit}px system-ui, sans-serif`;
+        x.textAlign = "center";
+        const says = gl.isContextLost() ? LOST : REFUSED;
+        says.forEach((line, k) => { x.fillText(line, w / 2, h / 2 + 20 * unit * (k - 1), 0.95 * w); });
+        canvas.title = says.join(" ");
+    }
+    function restored() {
+        program = programmed(gl) ?? programmed(gl);
+        held.fill(null);
+        canvas.title = "";
+        me.beside(twin);
+        me.show(block);
+    }
+    glass.addEventListener("webglcontextlost", (e) => { e.preventDefault(); me.draw(); });
+    glass.addEventListener("webglcontextrestored", restored);
     function paint() {
         const b = block, x = canvas.getContext("2d");
-        if (!gl || !b || !x || !canvas.clientWidth)
+        if (!b || !x || !canvas.clientWidth)
             return;
         const unit = Math.min(devicePixelRatio, 2), w = Math.round(canvas.clientWidth * unit), h = Math.round(canvas.clientHeight * unit);
         if (canvas.width !== w || canvas.height !== h) {
             canvas.width = w;
             canvas.height = h;
+        }
+        if (!program || gl.isContextLost()) {
+            lost(x, w, h, unit);
+            return;
         }
         const begun = performance.now(), size = extent(b), most = Math.max(...size), box = size.map((v) => v / most), [right, up, ahead] = axes();
         glass.width = Math.max(1, Math.round(w * scale));
