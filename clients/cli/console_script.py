@@ -18,10 +18,14 @@ at once.
 
 from __future__ import annotations
 
-import atexit
 import os
-import signal
 import sys
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    import signal
+else:
+    import _signal as signal  # in memory since Python began: nothing is searched for meanwhile
 
 INTERRUPTED = 130
 LINE = b"flexdt: interrupted\n"
@@ -86,6 +90,8 @@ def main() -> None:
         _command()
         return
     signal.signal(signal.SIGINT, _interrupt)
+    import atexit
+
     # Registered first it is called last, when all is done: Python itself takes its handlers away
     # before it has ended, and the signal would kill it.
     atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
@@ -96,8 +102,27 @@ def main() -> None:
         _command()
     except KeyboardInterrupt:
         leave()
+    except SystemExit as ended:
+        if ended.code == INTERRUPTED:
+            _end_without_teardown()
+        raise
     finally:
         signal.signal(signal.SIGINT, leave)
+
+
+def _end_without_teardown() -> None:
+    """End the process after its exit functions, without freeing its objects.
+
+    An interruption in the compiler leaves objects half made, and freeing them can crash.
+    """
+    import atexit
+
+    atexit._run_exitfuncs()
+    try:
+        sys.stdout.flush()
+        sys.stderr.flush()
+    finally:
+        os._exit(INTERRUPTED)
 
 
 def _command() -> None:
