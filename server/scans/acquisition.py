@@ -1,4 +1,5 @@
-"""Batches of a plan's frames made whole: positions to line integrals to counts to files.
+"""Complete processing of batches of a plan's frames: positions, line integrals, counts,
+files.
 
 Projection is awaited, counts and files are made in worker threads, so neither waits for the other.
 A frame depends on the plan, the sample, the truth and the scan's seed only. When frames are due is
@@ -44,12 +45,11 @@ class Acquisition:
         plan: the scan.
         radiography: how images are made.
         sample: on the stage when the scan began.
-        seed: of the noise; None for none.
+        seed: of the noise; None for no noise.
         put: stores an image.
         moments: poses averaged within the exposure of a frame taken in motion.
-        shown: told of images for watchers.
-        ensure_same: raises if the sample has become another one; asked after each
-            projection.
+        shown: called with images for watchers.
+        ensure_same: raises if the sample has changed; called after each projection.
     """
 
     plan: ScanPlan

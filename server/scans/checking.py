@@ -1,8 +1,8 @@
 """Scripts and poses parsed, planned and swept: here when they are light, else in a worker process.
 
-The answer to a check comes back encoded, a plan in pieces that are each unpickled in a moment, so
-that the loop's interpreter is never held for long. What one check may take is `SECONDS` and
-`MEMORY_BYTES`; what is beyond it is refused with what is allowed.
+The answer to a check comes back encoded, a plan in pieces that are each unpickled in a
+moment, so that the loop's interpreter is never held for long. The limits of one check are
+`SECONDS` and `MEMORY_BYTES`; a larger one is refused with the limit.
 """
 
 from __future__ import annotations
@@ -67,8 +67,8 @@ class CheckInput:
         wish: script or poses.
         machine, profile, start: the scanner before.
         size: of the sample the beam sees.
-        pieces, parameters: what may collide, and the correction in force.
-        physics: how images are made, for what the open beam will count.
+        pieces, parameters: bodies of the sample, and the applied correction.
+        physics: model of images, for the counts of the open beam.
     """
 
     wish: ScanSource
@@ -128,7 +128,7 @@ class Checked:
     """Result of a successful check: the plan with its certificate.
 
     Attributes:
-        matter: what was checked. Nothing else enters a plan, so a scan with an equal
+        matter: the checked input. Nothing else enters a plan, so a scan with an equal
             input has this plan and needs no other check.
         plan: of the scan.
         warnings: in words.
@@ -143,7 +143,7 @@ class Checks:
     """Runs the checks of one server; `close` must be called at the end.
 
     Args:
-        apart: whether what takes long is done in other processes.
+        apart: whether long checks run in other processes.
     """
 
     def __init__(self, apart: bool = True) -> None:

@@ -1,9 +1,9 @@
 """Frames on their way from a scan to its files: bounded, batched, and each done exactly once.
 
-A scan puts frames in; a few workers take what is waiting, in batches of one kind, and hand each
-batch to `produce`. Under real-time pace every frame goes at once, at full speed batches fill up;
-the result does not depend on it. When `produce` fails the worker keeps its batch and waits to be
-told to try again, so nothing is lost and nothing is done twice.
+A scan adds frames; a few workers take waiting frames, in batches of one kind, and pass
+each batch to `produce`. At real-time pace every frame is processed at once, at full speed
+batches fill up; the result does not depend on it. When `produce` fails the worker keeps
+its batch and waits to be told to try again, so nothing is lost and nothing is done twice.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class FramePipeline(Generic[T]):
     """A bounded queue of frames with workers that process them.
 
     Attributes:
-        produce: makes and stores a batch; raises what `failed` is to hear.
+        produce: makes and stores a batch; its errors are passed to `failed`.
         failed: called with the exception when a batch could not be made.
         kind: frames of different kinds never share a batch.
         batch: most frames a batch.

@@ -1,8 +1,8 @@
-"""A job that a full disk or an absent projector has paused goes on by itself, with back-off.
+"""A job paused by a full disk or an absent projector continues by itself, with back-off.
 
-Each attempt waits twice as long as the one before, up to half a minute; for a disk also until there
-is room for what could not be written. Whoever pauses, steps or moves by hand takes over: then only
-`job.resume` goes on. What a person has to decide is not retried.
+Each attempt waits twice as long as the one before, up to half a minute; for a disk also
+until there is room for the unwritten data. A user who pauses, steps or moves by hand
+takes over: then only `job.resume` continues. Decisions of a user are not retried.
 """
 
 from __future__ import annotations

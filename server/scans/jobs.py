@@ -1,9 +1,9 @@
 """Scans as jobs: a queue, one at a time, each a plan run into a data set that can be resumed.
 
-A job outlives the client that asked for it. What cannot go on (projector gone, disk full, E-stop)
-pauses it with the reason; a job that ends early leaves its data set marked incomplete, and the same
-script submitted under the same name takes up where it stopped, with the same noise. Who may
-command is decided in `handlers`.
+A job outlives the client that submitted it. A job that cannot continue (projector gone,
+disk full, E-stop) pauses it with the reason; a job that ends early leaves its data set
+marked incomplete, and the same script submitted under the same name takes up where it
+stopped, with the same noise. Who may command is decided in `handlers`.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Jobs:
         changed: called with a job whenever its status has changed.
         max_waiting: jobs in the queue at a time.
         projectors: that make frames at the same time.
-        root: the data directory, from which errors tell where files are.
+        root: the data directory, to name the paths of files in errors.
         max_ended: ended jobs that are known; beyond them the oldest is forgotten.
         max_age: of an ended job that is known.
         today: the date.
@@ -248,7 +248,9 @@ class Jobs:
         )  # fmt: skip
 
     def enqueue(self, draft: Job) -> Job:
-        """Put a drafted job at the end of the queue; one that goes on stays the same object."""
+        """Put a drafted job at the end of the queue; a continued job stays the same
+        object.
+        """
         self._count += draft.id not in self._all
         job = self._all.setdefault(draft.id, draft)
         vars(job).update(vars(draft))
@@ -289,7 +291,7 @@ class Jobs:
         Args:
             job: to end; one that has ended stays as it is.
             reason: for the data set.
-            by: connection that asks.
+            by: connection of the request.
         """
         if job.phase in ENDED:
             return

@@ -99,8 +99,8 @@ class ScanRunner:
     """One run of one plan.
 
     Attributes:
-        plan: what to do; it must hold.
-        scanner: moved and set as the plan says.
+        plan: the checked plan to run.
+        scanner: moved and set by the plan.
         clock: the twin's.
         produce: computes and stores a batch of frames.
         done: names of frames that exist already; they are not made again.
@@ -151,7 +151,9 @@ class ScanRunner:
     # Control ------------------------------------------------------------------------------------
 
     def pause(self, error: Exception | None = None) -> None:
-        """Stop motion and wait for `resume`; `error` says why, when it was not asked for."""
+        """Stop motion and wait for `resume`; `error` is the reason if no user requested
+        it.
+        """
         if error is not None:
             self._set(error=error)
         if self._kept is None:
@@ -198,11 +200,12 @@ class ScanRunner:
     # Running ------------------------------------------------------------------------------------
 
     async def run(self) -> None:
-        """Run the whole plan; frames that exist are passed over without waiting for them.
+        """Run the complete plan; existing frames are skipped without waiting for their
+        time.
 
         Raises:
             JobAborted: it was ended before the end.
-            TwinError: a frame cannot be made, whoever tries.
+            TwinError: a frame cannot be made, at any attempt.
         """
         self._pipeline.open()
         try:
@@ -249,7 +252,9 @@ class ScanRunner:
         return frames[0] if frames else self.plan.duration_s
 
     def _not_made(self, error: Exception) -> None:
-        """Pause and wait for what may mend; end where the same frames would meet it again."""
+        """Pause after an error that may pass; end the run if the same frames would fail
+        again.
+        """
         if hopeless(error):
             self._end = error
             self.abort()
@@ -325,7 +330,9 @@ class ScanRunner:
             self._stop()
 
     def _stop(self) -> None:
-        """Stop what the run moves; what is moved by hand beside a run that cannot go on goes on."""
+        """Stop the run's motion; motion by hand during a run that cannot continue is not
+        stopped.
+        """
         if self._moves:
             self.scanner.stop(self.clock.now())
 
@@ -390,7 +397,7 @@ class ScanRunner:
         self._set(tau=tau)
 
     async def _return_to(self, start: Mapping[str, float]) -> None:
-        """Move to where a programme begins; gives up early when told to pause or end.
+        """Move to the beginning of a programme; ends early on a pause or an abort.
 
         Raises:
             CollisionError: the way there.

@@ -1,4 +1,4 @@
-"""What a scan was asked to be and what it started from, kept in DATA/jobs so that it can go on.
+"""A scan's request and start conditions, kept in DATA/jobs so that it can be resumed.
 
 One JSON file a data set that is not complete: the wish (script byte for byte, or poses), the
 scanner's state at the start, sample, seed, pace. With it any later server makes exactly the missing
@@ -43,7 +43,7 @@ class PoseList:
 
     Attributes:
         text: JSON, one pose after the other; equal poses have equal texts.
-        listing: what a data set's script says of them, a comment line each.
+        listing: their comment lines in a data set's script, one each.
     """
 
     text: bytes
@@ -102,8 +102,8 @@ class StartConditions:
     """Conditions at a scan's start, kept so that it can be resumed.
 
     Attributes:
-        revision: names what the sample's upload showed then; None for a shipped phantom,
-            and in what older servers wrote.
+        revision: content of the sample's upload at that time; None for a shipped phantom,
+            and in records of older servers.
     """
 
     start: StartState
@@ -124,10 +124,10 @@ class JobRecord:
     """The data kept with a data set.
 
     Attributes:
-        wish: what was asked for.
-        begin: what it starts from.
+        wish: the requested scan.
+        begin: conditions at its start.
         speed_up: the job's; None for the clock's.
-        operator: the program that asked.
+        operator: the program that submitted it.
     """
 
     wish: ScanSource
@@ -163,7 +163,8 @@ class JobRecord:
 
     @staticmethod
     def remove(root: Directory, name: str) -> None:
-        """Delete the one of a data set that is complete: nothing goes on from it; errors are logged
+        """Delete the record of a complete data set, which is not resumed; errors are
+        logged
 
         A file that stays is harmless.
         """

@@ -1,4 +1,4 @@
-"""What stands on the stage, for everyone who must know its shape: collisions, ways around them,
+"""The sample on the stage, for all users of its shape: collisions, ways around them,
 checks, drawings.
 
 Convex pieces and sizes of samples follow from the phantoms and are worked out once. A guard is
@@ -50,7 +50,7 @@ class Stage:
 
     Args:
         machine, profile: whose stage.
-        samples: what may stand on it.
+        samples: available samples.
     """
 
     def __init__(self, machine: Machine, profile: Profile, samples: SampleStore) -> None:
@@ -67,7 +67,9 @@ class Stage:
         return self._samples.load(sample.name, sample.material) if sample.name else None
 
     def revision(self, sample: Sample) -> str | None:
-        """Names what the upload of a sample shows, once it has been read; None for others."""
+        """Return the revision of a sample's upload, once it has been read; None for
+        others.
+        """
         return self._samples.revision(sample.name)
 
     def pieces(self, sample: Sample, upload: ReceivedSample | None = None) -> tuple[Polytope, ...]:

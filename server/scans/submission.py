@@ -1,9 +1,9 @@
 """From a script or poses to a job: check, name, data set, resume.
 
-Everything that can be wrong is said before a job exists: the script's problems, collisions, room on
-the disk, a name that is taken. When the job's turn comes and the scanner, its sample or its
-correction have changed since, the scan is planned and checked anew. What a resumed scan must repeat
-(start, sample, seed) lies in DATA/jobs. `jobs` runs it.
+All errors are reported before a job exists: the script's problems, collisions, room on
+the disk, a name that is taken. When the job's turn comes and the scanner, its sample or
+its correction have changed since, the scan is planned and checked again. The conditions
+that a resumed scan must repeat (start, sample, seed) are in DATA/jobs. `jobs` runs it.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Prediction:
 
     Attributes:
         exposures: of each setting of tube and camera, for the data set.
-        problems: warnings of pixels behind the sample, for whoever submits.
+        problems: warnings of pixels behind the sample, for the user who submits.
     """
 
     exposures: tuple[PredictedExposure, ...]
@@ -84,11 +84,11 @@ class Submissions:
         keeper: writes a job down before it is in the queue.
         job_files: where it is written.
         now: the date.
-        shown: told of images for watchers.
+        shown: called with images for watchers.
         seed: makes the noise's seed of a new scan; None for scans without noise.
         version: of the software, for data sets.
         room: on the disk.
-        checks: of what is submitted.
+        checks: of submitted scans.
     """
 
     scanner: ScannerTwin
@@ -122,7 +122,7 @@ class Submissions:
         return Encoded(tuple(await self.checks.report(matter, codec)))
 
     def close(self) -> None:
-        """End what checks and predicts."""
+        """End the processes of checks and predictions."""
         self.checks.close()
         for task in self._predicting:
             task.cancel()
@@ -138,8 +138,8 @@ class Submissions:
         """Put a scan in the queue; `ensure_allowed` raises if the requester has lost control.
 
         Raises:
-            RpcError: -32005 script invalid, -32002 collisions, -32602 the name is taken, -32003
-                the sample of what is resumed is another one.
+            RpcError: -32005 script invalid, -32002 collisions, -32602 the name is taken,
+                -32003 the sample of the resumed scan has changed.
             LimitError, DiskFullError, DatasetNameError.
         """
         resumed = self._resumable(name, wish) if name is not None else None
@@ -382,7 +382,7 @@ class Submissions:
         return JobInputs(plan, writer, acquisition.produce, finished)
 
     def _ensure_same(self, begin: StartConditions) -> None:
-        """Check that a scan's sample, which has been read, is what it was when the scan began.
+        """Check that a scan's sample, once read, has not changed since the scan began.
 
         Raises:
             RpcError: -32003, another file has come under its name.

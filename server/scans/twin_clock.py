@@ -1,9 +1,9 @@
 """The twin's clock: virtual seconds that run at a multiple of real ones, or as fast as possible.
 
-With a number for `speed_up` time flows; with "max" it stands still while anybody works and jumps to
-the next moment somebody waits for. Work that must not be outrun (a scan whose frames are not yet
-computed) holds the clock meanwhile, so twin time, not correctness, gives way: the real-time factor
-that results is measured. One event loop owns it.
+With a number for `speed_up` time flows; with "max" it stops while any task works and
+jumps to the next awaited moment. Work that must not be outrun (a scan whose frames are
+not yet computed) holds the clock meanwhile, so twin time, not correctness, gives way: the
+real-time factor that results is measured. One event loop owns it.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def check_speed_up(value: float | str) -> SpeedUp:
     """Return `value` if it is "max" or a number the clock can run at.
 
     Raises:
-        LimitError: says what is allowed.
+        LimitError: names the allowed values.
     """
     if value == "max":
         return "max"

@@ -1,6 +1,7 @@
-"""What can be wrong with a data set, one type for each thing a caller may want to handle.
+"""Errors of data sets, one type for each case that a caller may want to handle.
 
-Every message says which file, what was found and what is allowed; `data["path"]` names the file.
+Every message names the file, the value found and the allowed values; `data["path"]` names
+the file.
 """
 
 from __future__ import annotations

@@ -31,10 +31,10 @@ def plain_name(name: str, what: str = "file") -> str:
 
     Args:
         name: as it came.
-        what: what is named, for the message.
+        what: kind of the named thing, for the message.
 
     Raises:
-        DatasetNameError: says what is wrong and what is allowed.
+        DatasetNameError: the name is not allowed; the message names the rule.
     """
     reason = _reason(name)
     if reason is not None:

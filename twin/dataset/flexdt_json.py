@@ -1,8 +1,8 @@
 """A scan's record as one frozen value, and `flexdt.json`, the document of it.
 
-`ScanRecord` is everything the files of a data set are made from. All geometry in it is nominal
-(motors and profile); the correction in force stands beside it, and the hidden misalignment is
-nowhere in it. Dates are arguments.
+`ScanRecord` is everything the files of a data set are made from. All geometry in it is
+nominal (motors and profile); the applied correction is kept with it, and the hidden
+misalignment is nowhere in it. Dates are arguments.
 
 `flexdt.json` says what the scanner's own texts cannot express, as one versioned document: machine
 and profile in full, nominal cone_vec, motor positions and time of every frame, the correction in
@@ -116,7 +116,8 @@ class ScanRecord(ArrayValue):
         profile: zero offsets in force.
         camera: settings of the projections.
         kV, power_W: tube settings of the projections.
-        positions: axis -> value when the settings file was written [mm, deg], script's sign.
+        positions: axis -> value when the settings file was written [mm, deg], script's
+            sign.
         speeds, accelerations: axis -> value at that moment.
         blocks: all saved images, in the order taken, done or not.
         smooth: whether the projections were taken in motion.
@@ -126,9 +127,10 @@ class ScanRecord(ArrayValue):
         reason: why not, for people.
         sample, noise, correction: see their types.
         operator: who submitted it.
-        flat_axis: the motor that took the sample out of the beam, "" if none.
+        flat_axis: the motor that took the sample out of the beam, or "".
         version: of the software.
-        predicted: counts of the projections' settings, as they were predicted at submission.
+        predicted: counts of the projections' settings, as they were predicted at
+            submission.
     """
 
     name: str
@@ -444,7 +446,9 @@ class DatasetDocument(_Model):
     settings_positions: dict[str, float] = Field(default_factory=dict)
     """Motor -> position when the settings texts were written [mm, deg], script's sign."""
     predicted: list[PredictedEntry] = Field(default_factory=list)
-    """Counts of each setting of the projections, predicted at submission; none in older files."""
+    """Counts of each setting of the projections, predicted at submission; empty in older
+    files.
+    """
     frames: list[FrameEntry]
 
     @classmethod
@@ -566,7 +570,7 @@ def parse_document(text: str, file: str = DOCUMENT) -> DatasetDocument:
     """Read `flexdt.json`.
 
     Raises:
-        DatasetFormatError: names file, key path, value and what is allowed.
+        DatasetFormatError: names file, key path, value and allowed values.
     """
     try:
         content = parse_json(text)

@@ -135,11 +135,11 @@ def rebuild(
 
 
 def physical(settings: ScanSettings, file: str) -> tuple[ScanSettings, list[str]]:
-    """Settings with the detector where it physically is, and what that changes.
+    """Move the detector of the settings to its physical place, and note the changes.
 
-    Some FleX-ray files have `mag_det_phys` beside `mag_det`. Where the two differ, the printed SDD
-    and COR are for the wrong one, and SDD is longer by the difference (as public corrections of
-    such scans have it); the axis's shadow moves in proportion.
+    Some FleX-ray files have `mag_det_phys` as well as `mag_det`. Where the two differ,
+    the printed SDD and COR are for the wrong one, and SDD is longer by the difference (as
+    public corrections of such scans have it); the axis's shadow moves in proportion.
 
     Raises:
         DatasetFormatError: the detector would not be behind the axis.

@@ -1,4 +1,5 @@
-"""`scan settings.txt` as a frozen value: what the scanner prints about one scan, in its own terms.
+"""`scan settings.txt` as a frozen value: the scanner's description of one scan, in its
+own terms.
 
 Positions carry the sign of the settings file (`Axis.settings_sign`), HC, VC and COR are measured
 from the pixel's edge, and every field may be absent (None). `rebuild` interprets it,
@@ -40,7 +41,7 @@ class Entry:
     Attributes:
         kind: how it is written in `scan settings.txt`.
         key: of its line there; empty if it shares another's.
-        xre: section and key in `data settings XRE.txt`; None where that does not say it.
+        xre: section and key in `data settings XRE.txt`; None if it is not stated there.
         separator: between key and value in `scan settings.txt`.
     """
 

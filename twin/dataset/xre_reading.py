@@ -1,4 +1,5 @@
-"""`data settings XRE.txt` as sections of plain texts, and what of `scan settings.txt` it says.
+"""`data settings XRE.txt` as sections of plain texts, and as the content of `scan
+settings.txt`.
 
 Unknown keys are kept without interpretation.
 """

@@ -115,8 +115,8 @@ def read_flexdata(
 
     Args:
         text: the file.
-        views: number of projections, where the file does not say it (only ours do).
-        shape: detector (rows, cols), likewise.
+        views: number of projections, if not in the file (only ours state it).
+        shape: detector (rows, cols), if not in the file.
         file: for messages.
 
     Raises:

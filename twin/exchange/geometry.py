@@ -1,9 +1,9 @@
 """The geometry of a scan as it travels between programs, and the error for formats that cannot
 represent it.
 
-`ScanGeometry` is what every reader of this package returns and every writer takes: cone_vec rows
-and the detector's shape. `circle_of` finds the circle of a cone_vec, for formats that support
-nothing else.
+`ScanGeometry` is returned by every reader of this package and taken by every writer:
+cone_vec rows and the detector's shape. `circle_of` finds the circle of a cone_vec, for
+formats that support nothing else.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ SQUARE: Final = 1e-9
 
 
 class ExchangeError(TwinError):
-    """A file that is not valid, or a geometry that a format cannot carry: what, where,
-    why.
+    """A file that is not valid, or a geometry that a format cannot carry, with place and
+    reason.
     """
 
 
@@ -35,9 +35,9 @@ class ScanGeometry:
     """Geometry of the projections of one scan.
 
     Attributes:
-        cone_vec: what a reconstruction is to use, object frame [mm].
-        shape: detector (rows, cols); None where the format does not say.
-        real: what is so although a reconstruction does not know it (CTSimU); None: as cone_vec.
+        cone_vec: geometry for the reconstruction, object frame [mm].
+        shape: detector (rows, cols); None if unknown.
+        real: true geometry, unknown to a reconstruction (CTSimU); None: as cone_vec.
         name: of the scan, "" if unknown.
         files: the images' names, () if unknown.
         notes: remarks for the reader.
@@ -158,7 +158,7 @@ def require_each(what: str, off: FloatArray, most: float) -> None:
     """Check a figure of every view, (n,).
 
     Raises:
-        ExchangeError: one is above `most`; says in which view it is largest.
+        ExchangeError: one is above `most`; names the view with the largest.
     """
     view = int(np.argmax(off))
     if off[view] > most:

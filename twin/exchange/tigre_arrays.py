@@ -1,13 +1,14 @@
 """TIGRE's cone geometry: the attributes of its `Geometry`, with an offset a view where it varies,
 and the angles (compared with the source of version 3.1.3, commit e702473).
 
-TIGRE's frame is ours. At angle a its source stands at DSO (cos a, sin a, 0), a panel without offset
-opposite; u points to +y and the rows grow upwards at a = 0. So its angle is ours less 90 deg, and
-the rows of a panel that grow downwards are a pitch of 180 deg. `offOrigin` moves source and panel
-together, `offDetector` the panel in its plane before it turns, and `rotDetector` (about x, y and z,
-the turn about z last) turns it about its centre. The angle is that of the panel's normal, so that
-DSD and DSO are those along it, which is what TIGRE's FDK weighs by; it reads offsets of a panel
-aside where one holds for all views, so an attribute that is the same in all views is written once.
+TIGRE's frame is ours. At angle a its source stands at DSO (cos a, sin a, 0), a panel
+without offset opposite; u points to +y and the rows grow upwards at a = 0. So its angle
+is ours less 90 deg, and the rows of a panel that grow downwards are a pitch of 180 deg.
+`offOrigin` moves source and panel together, `offDetector` the panel in its plane before
+it turns, and `rotDetector` (about x, y and z, the turn about z last) turns it about its
+centre. The angle is that of the panel's normal, so that DSD and DSO are those along it,
+by which TIGRE's FDK weighs; it reads offsets of a panel aside where one holds for all
+views, so an attribute that is the same in all views is written once.
 """
 
 from __future__ import annotations

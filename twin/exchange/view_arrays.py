@@ -1,4 +1,6 @@
-"""Named arrays of a geometry, as other programs take them: what the readers of such files check."""
+"""Named arrays of a geometry, as other programs take them: checks for readers of such
+files.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Look at geometry, images, volumes and files for what contradicts itself or cannot be.
+"""Checks of geometry, images, volumes and files for contradictions and impossible values.
 
-Every door of the library asks `examine`; the severity of what it finds decides whether the door
-refuses, warns or says nothing.
+Every entry point of the library calls `examine`; the severity of its findings decides
+whether the entry point raises an error, warns or does nothing.
 """
 
 from flexdt.twin.plausibility.examination import Operation, examine

@@ -1,4 +1,4 @@
-"""The one look that every door takes at what it is given."""
+"""The common check of all entry points' input."""
 
 from __future__ import annotations
 
@@ -48,15 +48,16 @@ def examine(
     boxes: npt.ArrayLike | None = None,
     grid: FloatArray | None = None,
 ) -> tuple[Finding, ...]:
-    """Find what contradicts itself in what an operation is given.
+    """Find contradictions in the input of an operation.
 
     Args:
-        operation: what is to be done.
+        operation: operation to be done.
         geometry: of the views.
         shape: detector (rows, cols), or None where it is not known.
         images: line integrals (n, rows, cols).
         volume: values of voxels [1/mm].
-        boxes: low and high corner of the box around each part of a sample, (k, 2, 3) [mm].
+        boxes: low and high corner of the box around each part of a sample, (k, 2, 3)
+            [mm].
         grid: low and high corner of the volume that is to be found, (2, 3) [mm].
 
     Example:

@@ -57,8 +57,8 @@ class Finding:
 
     Attributes:
         kind: one of `KINDS`.
-        cause: what was found, with its figure and unit.
-        remedy: what the user can do.
+        cause: the contradiction, with its figure and unit.
+        remedy: possible action of the user.
         severity: reaction of an entry point.
         figure: the figure by which it was found, in the unit given in `cause`.
     """

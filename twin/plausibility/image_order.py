@@ -1,4 +1,4 @@
-"""The order in which image files belong, by the numbers in their names, and what is wrong with it.
+"""The order of image files by the numbers in their names, and errors in it.
 
 Names hold whole numbers, decimals, negative numbers or angles (`p_0.25`, `a-10`, `x_180deg`). How
 they are written is found from all names together: 1.10 follows 1.9 where 1.1 is there, too.
@@ -36,7 +36,7 @@ class Ordered:
 
     Attributes:
         names: in the order of their numbers.
-        findings: what is wrong with them.
+        findings: errors in them.
         others: of `names`, those that are written otherwise than the rest.
     """
 

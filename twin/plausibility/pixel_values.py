@@ -30,7 +30,7 @@ so low."""
 
 
 def integral_findings(images: npt.NDArray[Any]) -> Iterator[Finding]:
-    """Find what is given as line integrals and is something else.
+    """Find images given as line integrals that are none.
 
     Args:
         images: some of the scan's, (k, rows, cols).
@@ -80,7 +80,7 @@ def _beam(images: npt.NDArray[Any]) -> float | None:
 
 
 def volume_findings(values: npt.NDArray[Any]) -> Iterator[Finding]:
-    """Find what is given as attenuation and is something else.
+    """Find volumes given as attenuation that are none.
 
     Args:
         values: of the voxels (nz, ny, nx).

@@ -1,4 +1,4 @@
-"""Flat images against each other, and against the open beam beside the object."""
+"""Comparison of flat images with each other and with the open beam at the object's side."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def flat_findings(flats: npt.NDArray[Any], dark: npt.NDArray[Any]) -> Iterator[F
 
 
 def beam_findings(levels_seen: Sequence[float | None]) -> Iterator[Finding]:
-    """Find an open beam beside the object that is not that of the flat image.
+    """Find an open beam at the object's side that differs from the flat image.
 
     Args:
         levels_seen: of the open beam in some views (`open_beam`), relative to the flat image.

@@ -26,7 +26,7 @@ UNITS: Final = "are all lengths in mm?"
 def placement_findings(
     cone_vec: ConeVec, shape: tuple[int, int], boxes: npt.ArrayLike, *, exposed: bool = False
 ) -> Iterator[Finding]:
-    """Find what is doubtful about the views of a sample.
+    """Find doubts about the views of a sample.
 
     Args:
         cone_vec: the views.

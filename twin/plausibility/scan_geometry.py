@@ -1,4 +1,6 @@
-"""A scan's geometry by itself: distances, units, and what its angles cover for a method."""
+"""Checks of a scan's geometry alone: distances, units, and coverage of angles for a
+method.
+"""
 
 from __future__ import annotations
 
@@ -70,7 +72,7 @@ def distance_findings(
 
 
 def geometry_findings(cone_vec: ConeVec, shape: tuple[int, int] | None) -> Iterator[Finding]:
-    """Find what no scanner has in the rows of a geometry.
+    """Find rows of a geometry that no scanner has.
 
     Args:
         cone_vec: n views.

@@ -1,4 +1,4 @@
-"""What a file states of a scan, its angles and pixel, against the geometry that it is given."""
+"""Comparison of a file's angles and pixel size with the given geometry."""
 
 from __future__ import annotations
 

@@ -36,13 +36,13 @@ def grid_findings(
     *,
     layers: bool = True,
 ) -> Iterator[Finding]:
-    """Find grids beside the field of view.
+    """Find grids outside the field of view.
 
     Args:
         cone_vec: n views.
         shape: detector (rows, cols).
         low, high: corners of the grid, (3,) [mm].
-        layers: those above and below the panel count; FDK makes them NaN and says so.
+        layers: count those above and below the panel; FDK makes them NaN and warns.
     """
     if not len(cone_vec) or max(shape) < 2 or (not layers and shape[1] < 2):
         return

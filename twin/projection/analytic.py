@@ -155,7 +155,7 @@ def _project(
         out.fill(0)
         return
     shapes = [as_convex(solid.shape) for solid in solids]
-    # What `analytic_kernels` takes: has a quadric, M, c; slabs, and which of them are a solid's.
+    # Input of `analytic_kernels`: has a quadric, M, c; slabs, and which of them are a solid's.
     quadric = np.array([[one.curved, *one.matrix.ravel(), *one.center] for one in shapes], float)
     ends = np.cumsum([0, *(len(one.slabs) for one in shapes)])
     rays = run_through(geometry, np.concatenate([hull_points(one) for one in shapes])).rays(shape)
@@ -177,7 +177,7 @@ TRIANGLE_NS = 20.0
 
 
 def warm_up() -> None:
-    """Run what `project_scene`, `forward` and `back` into new memory do, on tiny problems."""
+    """Run `project_scene`, `forward` and `back` into new memory on tiny problems."""
     warm_up_forward()
     warm_up_back()
 

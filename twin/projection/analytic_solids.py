@@ -1,5 +1,5 @@
-"""Analytic solids with exact chords, as frozen values: the parts of a phantom; and what the kernels
-make of them.
+"""Analytic solids with exact chords, as frozen values: the parts of a phantom; and the
+arrays that the kernels make of them.
 
 Attenuation is additive: a scene's line integral is the sum over its solids of chord length times
 `mu_per_mm`, so a bead inside a brick carries the difference (bead minus brick) and a hole carries
@@ -97,8 +97,10 @@ class Scene:
 
 @dataclass(frozen=True, eq=False)
 class Convex:
-    """One shape: M and c of the quadric (M = 0 if none), slabs (k, 5) = n, low, high [mm], and
-    what bounds it: the semi-axes of an ellipsoid (3, 3), or corner points (m, 3), or neither.
+    """One shape: M and c of the quadric (M = 0 if none), slabs (k, 5) = n, low, high [mm],
+        and
+    what bounds it: the semi-axes of an ellipsoid (3, 3), or corner points (m, 3), or
+        neither.
     """
 
     matrix: FloatArray

@@ -32,7 +32,8 @@ class DeviceArray(NDArrayOperatorsMixin):
     Attributes:
         flat: numba's one-dimensional array.
         shape: (n, rows, cols) of images, (nz, ny, nx) of voxels.
-        grid: of voxels, where each lies in `flat`; what its layout holds is not used.
+        grid: of voxels, by which each is found in `flat`; its layout's content is not
+            used.
     """
 
     flat: Any

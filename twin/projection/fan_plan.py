@@ -1,8 +1,9 @@
 """The fans of a view: groups of rays that may travel together, for `fan_kernels`.
 
-A fan is what lies between two lines of the detector that are images of planes through the source
-parallel to z; its width is bounded so that its rays stay within one voxel of each other in x and y.
-Views in which z is seen (nearly) end on have no fans. Pure geometry: no voxels are touched.
+A fan is the area between two lines of the detector that are images of planes through the
+source parallel to z; its width is bounded so that its rays stay within one voxel of each
+other in x and y. Views in which z is seen (nearly) end on have no fans. Pure geometry: no
+voxels are touched.
 
 For the transpose, `Turns` says which fans may add to the voxels at the same time. Seen along z a
 fan is a wedge with its point in the source. Neighbouring fans share voxel columns, fans with enough

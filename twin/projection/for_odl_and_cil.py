@@ -70,7 +70,7 @@ def cil_operator(
     Args:
         project, spread: projector and transpose.
         like: the grid.
-        geometry: the scan; the first view's distances stand in CIL's geometry.
+        geometry: the scan; the first view's distances are those of CIL's geometry.
         image_shape: (n, rows, cols).
     """
     from cil.framework import AcquisitionGeometry, ImageGeometry

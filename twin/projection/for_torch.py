@@ -33,7 +33,7 @@ class TorchOperator:
     and returned as float32, gradients in the type of their tensor.
 
     Attributes:
-        geometry: the scan, where none is given with the call.
+        geometry: the scan, if the call gives no geometry.
         like: the grid; its values are not used.
         detector_shape: (rows, cols).
         transposed: whether this is the adjoint.
@@ -64,9 +64,9 @@ class TorchOperator:
 
         Raises:
             GeometryError: a shape does not fit.
-            NotBuiltError: a tensor is on a device other than CUDA's, or a second derivative with
-                respect to the geometry is asked for.
-            DeviceError: the device failed; the log says of what.
+            NotBuiltError: a tensor is on a device other than CUDA's, or a second
+                derivative with respect to the geometry is requested.
+            DeviceError: the device failed; the log has the reason.
         """
         values = _tensor(values)
         rows = _tensor(self.geometry.rows if rows is None else rows)

@@ -1,10 +1,10 @@
 """The projector of one scan and one grid as a linear operator, for algorithms written as algebra.
 
-`A @ x` is `forward`, `A.T @ y` is `back`, and one is the exact transpose of the other: what least
-squares, proximal methods and automatic differentiation need. Arrays of other libraries come in by
-DLPack, and go out as arrays of the same library. SciPy, PyTorch, ODL and CIL get operators of their
-own kind; each of these libraries is imported by the method that is named after it, and by nothing
-else.
+`A @ x` is `forward`, `A.T @ y` is `back`, and one is the exact transpose of the other, as
+least squares, proximal methods and automatic differentiation need. Arrays of other
+libraries come in by DLPack, and go out as arrays of the same library. SciPy, PyTorch, ODL
+and CIL get operators of their own kind; each of these libraries is imported by the method
+that is named after it, and by nothing else.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class Operator:
     Attributes:
         geometry: the scan; an array (n, 12) [mm] is taken for one.
         like: the grid, a `Volume` (its values are not used) or a `Grid`.
-        detector_shape: (rows, cols): those of the geometry, or `shape`, if it carries none.
+        detector_shape: (rows, cols): those of the geometry, or else `shape`.
 
     Raises:
         GeometryError: the geometry does not hold, or the shape of the detector is not known.

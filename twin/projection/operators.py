@@ -517,8 +517,7 @@ def geometry_change(
     Args:
         volume: attenuation [1/mm].
         cone_vec: ConeVec or (n, 12) [mm], object frame.
-        change: (n, 12) or (12,): for each unit of the parameter, what is added to each
-            row [mm].
+        change: (n, 12) or (12,): change of each row for a unit of the parameter [mm].
         shape: detector (rows, cols); by default the geometry's own.
 
     Returns:

@@ -53,14 +53,16 @@ register."""
 
 @dataclass(frozen=True)
 class Accuracy:
-    """What the uniform regions of an object may be off by, noise not included.
+    """Largest errors of an object's uniform regions, noise not included.
 
     Attributes:
-        half: of the attenuation there, in half of them at most: the figure by which volumes are
-            compared.
+        half: of the attenuation there, in half of them at most: the figure by which
+            volumes are compared.
         most: in nine of ten at most.
-        cause: what contributes most to the others: angles, aside, cone, rows, beyond or drift.
-        cut_off: the object goes on beyond the panel's sides: the figures are estimates, no bounds.
+        cause: main contribution to the others: angles, aside, cone, rows, beyond or
+            drift.
+        cut_off: the object continues beyond the panel's sides: the figures are estimates,
+            not bounds.
     """
 
     half: float
@@ -127,7 +129,7 @@ class DeviceCopy:
     Attributes:
         flat: the storage.
         there: the same on the device, or None.
-        views: asked for so far.
+        views: number of views projected so far.
     """
 
     flat: Float32Array
@@ -302,7 +304,8 @@ class Volume:
 
         Args:
             axes: matplotlib's axes to draw into; None makes a figure.
-            what: `data`, or what `reconstruct` found of its errors: `sigma` or `bias_bound`.
+            what: `data`, or what `reconstruct` found of its errors: `sigma` or
+                `bias_bound`.
 
         Returns:
             The axes.
@@ -326,10 +329,10 @@ class Volume:
             window: attenuation of black and of white [1/mm]; None: percentiles of the volume.
 
         Returns:
-            What a notebook shows.
+            Display form in a notebook.
 
         Raises:
-            TwinError: a window that is none.
+            TwinError: the window is not valid.
 
         Example:
             >>> page = Volume(np.zeros((6, 4, 4)), voxel_mm=0.5).show()

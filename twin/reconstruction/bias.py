@@ -1,9 +1,11 @@
 """A bound of the bias in a volume of FDK, from the geometry and some of the images.
 
-A coarse volume of the object is projected and reconstructed on a ladder of scans: from one without
+A coarse volume of the object is projected and reconstructed on a ladder of scans: from
+    one without
 a flaw (parallel rays from everywhere, a panel that sees all) to the one at hand, one flaw a rung.
-What differs between two rungs is what that flaw does to an object like this one. Two flaws show in
-the images alone, and get a reconstruction each: what lies beyond the panel's edges, continued in
+The difference of two rungs is the effect of that flaw on such an object. Two flaws show in
+the images alone, and get a reconstruction each: what lies beyond the panel's edges,
+    continued in
 another way, and the drift of the flat, which is seen beside the object. A voxel's bound is what all
 of them come to about it.
 """
@@ -63,8 +65,8 @@ class Bias:
         even: weights of its nodes, little where values change fast and where some views
             do not see them, (nz, ny, nx).
         inside: nodes of the object, (nz, ny, nx).
-        causes: angles, aside, cone, rows, beyond or drift -> what it changes at most
-            [1/mm], (nz, ny, nx).
+        causes: angles, aside, cone, rows, beyond or drift -> its largest change [1/mm],
+            (nz, ny, nx).
         contradiction: between images and geometry, with which nothing is bounded.
     """
 
@@ -131,7 +133,7 @@ def bias_of(
     shape: tuple[int, int],
     truncation: Truncation | None = None,
 ) -> Bias | None:
-    """Find what may be off in FDK's volume of a scan.
+    """Find the possible errors of FDK's volume of a scan.
 
     Args:
         image: gives the line integrals of a view, (rows, cols), by its number.

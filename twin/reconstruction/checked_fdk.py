@@ -1,4 +1,4 @@
-"""FDK with all that is said of its volume: what lies beyond the panel, noise, bias and warnings."""
+"""FDK with estimates for its volume: object beyond the panel, noise, bias and warnings."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ class Rung:
     """One scan of the ladder.
 
     Attributes:
-        flaw: what it has and the one before does not.
+        flaw: the flaw that the rung before does not have.
         cone_vec: its views.
         shape: (rows, cols).
     """
@@ -73,7 +73,7 @@ class CoarseScan:
         cone_vec: of these.
         circle: of all views of the scan.
         angles: (n,) along it [rad].
-        truncation: what lies beyond the edges of these images.
+        truncation: object beyond the edges of these images.
         numbers: (n,) of these views among all of the scan.
         binned: rows and columns of the panel over which a pixel is the mean.
     """
@@ -123,8 +123,8 @@ class CoarseScan:
         return cls(images, scan, circle, circle.angle[numbers], truncation, numbers, binned)
 
     def thinned(self, *, all_views: bool = False) -> CoarseScan:
-        """Take fewer views and rows of a circle: enough to compare images with what a volume of
-        them gives when it is projected again.
+        """Take fewer views and rows of a circle: enough to compare images with the
+        projections of a volume of them gives when it is projected again.
 
         Args:
             all_views: take fewer rows alone.

@@ -1,10 +1,11 @@
 """Iterative reconstruction on the matched pair of projector and adjoint, for any trajectory.
 
-SIRT, SART (ordered subsets), CGLS and EM (maximum likelihood for positive data). Each algorithm is
-one function; all see geometry through `LinearSystem` only. Everything is held in memory. The
-caller chooses the number of iterations. SIRT and SART weigh line integrals by variances that are
-given, and then end once what is left is no more than that noise; they take the spectrum's hardening
-in several materials into account. SIRT, SART and CGLS solve a fine region in coarse surroundings.
+SIRT, SART (ordered subsets), CGLS and EM (maximum likelihood for positive data). Each
+algorithm is one function; all see geometry through `LinearSystem` only. Everything is
+held in memory. The caller chooses the number of iterations. SIRT and SART weigh line
+integrals by variances that are given, and then end when the residual is no more than that
+noise; they take the spectrum's hardening in several materials into account. SIRT, SART
+and CGLS solve a fine region in coarse surroundings.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What every iterative method has in hand: data, geometry, grid, and the pair of operators.
+"""The problem of every iterative method: data, geometry, grid, and the pair of operators.
 
 A `LinearSystem` works on plain arrays. A `RegionSystem` is one of two grids, a fine region and
 coarse surroundings, whose voxels are one array. Where a CUDA device has room for all that a method
@@ -75,8 +75,10 @@ class LinearSystem:
         measured: (n, rows, cols) line integrals.
         geometry: n views.
         like: the grid.
-        weights: (n, rows, cols) one over the variances of the line integrals; None: all alike.
-        hardening: what the spectrum does to line integrals through materials; None: nothing.
+        weights: (n, rows, cols) one over the variances of the line integrals; None: all
+            alike.
+        hardening: effect of the spectrum on line integrals through materials; None: no
+            effect.
     """
 
     measured: Float32Array
@@ -203,7 +205,8 @@ class DeviceProblem(LinearSystem):
     """A `LinearSystem` on a CUDA device: every array is a `DeviceArray`.
 
     Attributes:
-        returns: whether the volume goes back to the host, where the images came from.
+        returns: whether the volume is copied back to the host, where the images came
+            from.
     """
 
     returns: bool = True
@@ -242,8 +245,9 @@ class DeviceProblem(LinearSystem):
 class RegionSystem(LinearSystem):
     """A fine region in coarse surroundings, solved together: x holds the voxels of both, flat.
 
-    The surroundings' grid is laid so that the region fills a whole number of its voxels, which are
-    no unknowns: every point belongs to one voxel of one grid, and rays have their exact lengths.
+    The surroundings' grid is laid so that the region fills an integer number of its
+    voxels, which are no unknowns: every point belongs to one voxel of one grid, and rays
+    have their exact lengths.
 
     Attributes:
         outer: the surroundings' grid.

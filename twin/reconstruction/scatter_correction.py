@@ -1,13 +1,14 @@
-"""What is taken out of a scan's line integrals before reconstruction: hardening, scatter.
+"""Corrections of a scan's line integrals before reconstruction: hardening, scatter.
 
 Beam hardening comes from low energies being absorbed first; its correction is for objects of a
 single material, and iterative methods take the hardening in several into account (`Polychromatic`).
 Flat field and logarithm are in `flexdt.twin.dataset`, rings in `consistency/ring_pattern.py`.
 
-Scatter is found from the scan itself: FDK says how much the object attenuates, the names of its
-materials what it scatters. That scatter is simulated (`flexdt.twin.physics.scatter`) and subtracted
-from the measured signal, which gives a better volume, and so on until the scatter stays (Zbijewski
-and Beekman, IEEE Trans. Med. Imaging 25 (2006) 817). Grids are coarse, since scatter is smooth.
+Scatter is computed from the scan itself: FDK gives the object's attenuation, the names of
+its materials its scattering. That scatter is simulated (`flexdt.twin.physics.scatter`)
+and subtracted from the measured signal, which gives a better volume, and so on until the
+scatter stays (Zbijewski and Beekman, IEEE Trans. Med. Imaging 25 (2006) 817). Grids are
+coarse, since scatter is smooth.
 """
 
 from __future__ import annotations
@@ -111,13 +112,13 @@ def hardening(
 class Polychromatic:
     """Measurement of a spectrum behind several materials, for `sirt` and `sart`.
 
-    A voxel is of one material, as dense as its value says (Joseph and Spital, J. Comput.
-    Assist. Tomogr. 2 (1978) 100); the border between two is the geometric mean of their
-    attenuation at one energy. Paths through the materials so give the line integrals that
-    the volume has at this energy, and what the spectrum would have measured. Mixtures in
-    proportion instead would take noise of plastic for traces of metal, which harden the
-    beam, on average too much; a border halfway would take metal, which looks thin before
-    it is corrected, for dense plastic for good.
+    A voxel is of one material, with the density of its value (Joseph and Spital, J.
+    Comput. Assist. Tomogr. 2 (1978) 100); the border between two is the geometric mean of
+    their attenuation at one energy. Paths through the materials so give the line
+    integrals that the volume has at this energy, and the measurement of the spectrum.
+    Mixtures in proportion instead would take noise of plastic for traces of metal, which
+    harden the beam, on average too much; a border halfway would take metal, which looks
+    thin before it is corrected, for dense plastic for good.
 
     Attributes:
         mu: (m,) attenuation of each material at `energy_keV` [1/mm].
@@ -194,7 +195,7 @@ class Polychromatic:
 
 
 def require_apart(materials: Sequence[Substance], mu: FloatArray) -> None:
-    """Check that there are materials, and that a volume tells them apart.
+    """Check that there are materials, and that a volume separates them.
 
     Raises:
         LimitError: it does not.
@@ -238,7 +239,7 @@ class Scatterer:
     Attributes:
         thing: its voxels.
         changes: mean change of the scatter in each round, relative to its mean.
-        doubts: what is doubtful, in sentences.
+        doubts: doubts about the correction, in sentences.
     """
 
     thing: Object
@@ -309,7 +310,8 @@ def scatterer_of(
     kV: float,
     settings: ScatterSettings | None = None,
 ) -> Scatterer:
-    """Find what scatters in a circular scan, in rounds of FDK, simulation and subtraction.
+    """Find the scattering object of a circular scan, in rounds of FDK, simulation and
+    subtraction.
 
     A voxel that attenuates as much as one of the materials is taken for it; one between two of
     them, or between one and air, for a mixture. Line integrals are straightened (beam hardening)

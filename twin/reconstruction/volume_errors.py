@@ -1,7 +1,7 @@
-"""What is said of the errors of a volume, and values on a coarse grid between its nodes.
+"""Errors of a volume, and interpolation between the nodes of a coarse grid.
 
-A volume keeps what its noise and its bias are computed from, and computes `sigma`, `bias_bound` and
-`accuracy` of it when asked.
+A volume keeps the sources of its noise and bias, and computes `sigma`, `bias_bound` and
+`accuracy` from them on access.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ class BoundOf(Protocol):
 def with_errors(
     volume: Volume, noise: SigmaOf | None = None, bias: BoundOf | None = None
 ) -> Volume:
-    """Give a volume a `sigma` and a `bias_bound`, besides those it has.
+    """Add a `sigma` and a `bias_bound` to those of a volume.
 
-    Volumes that are made of it have none: they are no fields.
+    Volumes derived from it have none: they are no fields.
     """
     found = replace(volume)
     object.__setattr__(found, "_noise", noise or getattr(volume, "_noise", None))

@@ -1,4 +1,4 @@
-"""calibration.* and dataset.*: corrections, and scans that were made, as their folders say."""
+"""calibration.* and dataset.*: corrections, and recorded scans by their folders."""
 
 from __future__ import annotations
 

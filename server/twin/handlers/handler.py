@@ -1,4 +1,4 @@
-"""What handlers have in common: their type, the connection that they answer, changes that last.
+"""Common parts of handlers: their type, the client connection, changes that are saved.
 
 A change of the scanner that survives a restart is checked, certified, written, and only then made.
 One that is refused or cannot be written leaves everything as it is, in the scanner and on the disk.
@@ -45,7 +45,7 @@ class Client:
 
     Attributes:
         peer: where events go; its name is the connection's.
-        program: what the client called itself.
+        program: the client's own name.
     """
 
     peer: Peer
@@ -110,12 +110,12 @@ async def encoded_apart(client: Client, result: _R, count: int) -> _R | Encoded:
 async def change_settings(
     twin: TwinServer, change: Callable[[ScannerTwin], None], ready: Callable[[], None]
 ) -> None:
-    """Change what the scanner is set to.
+    """Change the scanner's settings.
 
     Args:
         twin: whose scanner.
         change: sets it; it is tried on a copy first.
-        ready: raises if who asked may not any more.
+        ready: raises if the client has lost control.
 
     Raises:
         DatasetWriteError: it cannot be written; nothing has changed.
@@ -149,11 +149,11 @@ async def change_stage(
 
     Args:
         twin: whose stage.
-        sample, correction: what is to be there; either may be what is there already.
-        ready: raises if who asked may not any more.
+        sample, correction: the new ones; either may be the present one.
+        ready: raises if the client has lost control.
         history: of corrections, with this one; None leaves it.
-        source: what a new correction came from.
-        upload: what is to stand under the sample's name from now on.
+        source: origin of a new correction.
+        upload: new content under the sample's name.
         scene: settings and positions that come with it.
 
     Returns:

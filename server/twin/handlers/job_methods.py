@@ -67,7 +67,7 @@ async def resume(twin: TwinServer, client: h.Client, params: p.JobRef) -> w.JobS
     """Back to the pose of the pause, and on; a job that ended early is queued once more.
 
     Raises:
-        RpcError: -32002, a contact lies ahead; the job stays paused.
+        RpcError: -32002, a contact is ahead; the job stays paused.
     """
     job = twin.jobs.get(params.job)
     if job.phase in ENDED and job.phase != "done":
@@ -91,7 +91,7 @@ async def step(twin: TwinServer, client: h.Client, params: p.JobRef) -> w.JobSta
 
 @h.answers(p.JOB_ABORT)
 async def abort(twin: TwinServer, client: h.Client, params: p.JobAbort) -> w.JobStatus:
-    """Ends the job with X-rays off; its data set stays, marked incomplete, and says why."""
+    """End the job with X-rays off; its data set stays, marked incomplete with the reason."""
     job = twin.jobs.get(params.job)
     twin.jobs.abort(job, params.reason, client.name)
     unsaved = ""

@@ -1,4 +1,4 @@
-"""session.*, state.*, scene.* and rpc.discover: who is there, the whole state, the wire itself."""
+"""session.*, state.*, scene.* and rpc.discover: clients, complete state, the wire itself."""
 
 from __future__ import annotations
 

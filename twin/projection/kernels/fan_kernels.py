@@ -1,4 +1,5 @@
-"""Exact Siddon for whole fans of rays at once, and its transpose: the fast path of the projector.
+"""Exact Siddon for complete fans of rays at once, and its transpose: the fast path of the
+projector.
 
 The rays of a fan leave the focal spot in (nearly) one plane parallel to z, so that seen along z
 they (nearly) share one line through the voxel columns; `fan_walk_kernels` carries them along it

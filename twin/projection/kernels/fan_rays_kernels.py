@@ -182,7 +182,7 @@ def sort_by_slope(grid, fan, found, rays, bins, n):
 
 @kernel
 def start(grid, fan, rays, work, n):
-    """Fill in what n sorted rays need for their walk, and list their first z crossings by slab."""
+    """Initialise n sorted rays for their walk, and list their first z crossings by slab."""
     slope, rise = rays.slope[:n], rays.rise[:n]
     weight, tilt, ratio, length = rays.weight[:n], rays.tilt[:n], rays.ratio[:n], rays.length[:n]
     cross, pace, level, acc = rays.cross[:n], rays.pace[:n], rays.level[:n], rays.acc[:n]

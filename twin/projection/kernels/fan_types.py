@@ -120,8 +120,9 @@ class Rays(NamedTuple):
 
 
 class Work(NamedTuple):
-    """A worker's arrays by slab (head of the list of crossings), by bin (first ray) and by level
-    (S or, transposed, what the level is to receive; Q likewise; jump at a vertex; zeros).
+    """A worker's arrays by slab (head of the list of crossings), by bin (first ray) and
+    by level (S or, transposed, the level's part; the same for Q; jump at a vertex;
+    zeros).
     """
 
     head: Any

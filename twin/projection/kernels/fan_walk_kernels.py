@@ -68,8 +68,8 @@ def mix(out, right, left, right_before, left_before):
 
 @inline
 def part_of(rays, first, last):
-    """Select what the correction at a vertex changes, of rays first to last - 1 of a
-    sorted fan.
+    """Select the arrays that the correction at a vertex changes, of rays first to last -
+    1 of a sorted fan.
     """
     some = slice(first, last)
     return rays.acc[some], rays.weight[some], rays.tilt[some], rays.level[some], rays.picked[some]
@@ -79,7 +79,7 @@ def part_of(rays, first, last):
 def correct(part, jump, offset, reach):
     """Subtract max(0, offset + tilt * reach) * weight * jump[level] from acc, ray by ray.
 
-    offset + tilt * reach is d, how far a ray lies beyond the vertex; weight is 1 / m.
+    offset + tilt * reach is d, the distance of a ray beyond the vertex; weight is 1 / m.
     """
     acc, weight, tilt, level, picked = part
     # Two loops: gathering by level cannot be vectorised, the arithmetic can.
@@ -487,7 +487,9 @@ def settle(rays, work, n):
 
 @inline
 def share_out(rays, work, n):
-    """Sum the values of the rays in each level: what the voxels of that level are to receive."""
+    """Sum the values of the rays in each level, which are added to the voxels of that
+    level.
+    """
     acc, ratio, level = rays.acc, rays.ratio, rays.level
     total, moment = work.total, work.moment
     total[:] = ZERO

@@ -74,8 +74,8 @@ LANES = 0xFFFFFFFF
 LANES_MEET = not config.ENABLE_CUDASIM
 """Whether lanes of a warp exchange values: in the simulator only where a test lets them."""
 FEW_REGISTERS = {} if config.ENABLE_CUDASIM else {"max_registers": 56}
-"""Nine blocks of 128 threads on a multiprocessor instead of seven take 0.8 times as long (H200,
-512^3); what does not fit is put aside once every 32 slabs."""
+"""Nine blocks of 128 threads on a multiprocessor instead of seven take 0.8 times as long
+(H200, 512^3); the rest is stored once every 32 slabs."""
 
 if config.ENABLE_CUDASIM:
     # What the simulator lacks. A lane there exchanges with itself, unless a test lets lanes meet.

@@ -294,8 +294,8 @@ def ends(total, length, d, jumps, moments):
     """Compute derivatives of the line integral by one coordinate of source and of pixel.
 
     total: sum of values times ray parameter, so that the integral is total * length; d:
-    what the ray covers along this axis [mm]; jumps, moments: sums of J and of J t over
-    its planes.
+    the ray's extent along this axis [mm]; jumps, moments: sums of J and of J t over its
+    planes.
     """
     stretch = total * d / length  # the ray grows longer
     if d == 0.0:
@@ -334,8 +334,9 @@ def gather(box, views, weights, tile, parts, first_job, last_job):
         views: (n, 12) source, first pixel minus source, u, v in voxel units of the box.
         weights: float32 (n, rows, cols).
         tile: columns a job.
-        parts: float64 zeros; row view * tiles + k belongs to the k-th tile of a view, a job.
-        first_job, last_job: what is done.
+        parts: float64 zeros; row view * tiles + k belongs to the k-th tile of a view, a
+            job.
+        first_job, last_job: range of jobs.
     """
     _, rows, cols = weights.shape
     tiles = (cols + tile - 1) // tile

@@ -1,5 +1,5 @@
-"""What a scan recorded, before anything is reconstructed of it.
+"""The recording of a scan, before any reconstruction.
 
-Its trajectory, panels that stand upright, what lies beyond their edges, and the voxels that its
+Its trajectory, upright panels, the object beyond their edges, and the voxels that its
 views cover.
 """

@@ -1,14 +1,14 @@
-"""Which voxels the views of a scan cover, what becomes of the others, and how views share voxels.
+"""Coverage of voxels by the views of a scan: scaling, loss, and shares of the views.
 
-A voxel near the upper or lower end of a circle's field of view lies above or below the panel in the
-views whose source is near. The other views still see lines of every direction through it, so what
-they gave is scaled. A voxel of which the data say too little is NaN.
+A voxel near the upper or lower end of a circle's field of view is above or below the
+panel in the views whose source is near. The other views still see lines of every
+direction through it, so their sum is scaled. A voxel with too few data is NaN.
 
-A voxel of a helix is seen from the same side once a turn, higher or lower on the panel. Each such
-view counts by its row, most in the middle of the panel and least at its upper and lower edge, and
-all together once: the aperture weights of weighted FDK (Stierstorfer et al., Phys. Med. Biol. 49
-(2004) 2209), for views a whole turn apart, so that no rays are resampled. Every voxel must be seen
-in every direction, which limits the rise in a turn.
+A voxel of a helix is seen from the same side once a turn, higher or lower on the panel.
+Each such view counts by its row, most in the middle of the panel and least at its upper
+and lower edge, and all together once: the aperture weights of weighted FDK (Stierstorfer
+et al., Phys. Med. Biol. 49 (2004) 2209), for views a full turn apart, so that no rays are
+resampled. Every voxel must be seen in every direction, which limits the rise in a turn.
 """
 
 from __future__ import annotations
@@ -44,7 +44,8 @@ def normalise_coverage(
     *,
     cut_off: bool,
 ) -> None:
-    """Scale voxels that lie above or below the panel in some views; those seen too little are NaN.
+    """Scale voxels that are above or below the panel in some views; those seen too little
+    are NaN.
 
     See `fdk_kernels.normalise_coverage`. Of many views, one stands for some neighbours.
 
@@ -52,12 +53,12 @@ def normalise_coverage(
         data: the volume's, (ny, nx, nz), changed in place.
         like: its grid.
         circle: of the views.
-        table: what the kernel needs of each view, (n, 11).
+        table: the kernel's table of the views, (n, 11).
         weights: of rays, (n, cols).
         rows: of the images.
         panel: first and last column of the panel, among the images' columns.
-        cut_off: whether the panel cuts the object off, so that voxels which are not seen in lines
-            of all directions become NaN.
+        cut_off: whether the panel cuts the object off, so that voxels which are not seen
+            in lines of all directions become NaN.
     """
     from flexdt.twin.reconstruction.kernels import fdk_kernels
 

@@ -1,9 +1,9 @@
 """Images of a tilted panel as an upright one would have recorded them.
 
 A pinhole image on one plane determines the image on any other through the same source: a
-homography. FDK filters along rows, which must be horizontal; this makes them so. A panel that lies
-on its side has rows and columns swapped first, which costs nothing. Images of an upright panel are
-returned as they are; a panel that lies flat is an error.
+homography. FDK filters along rows, which must be horizontal; this makes them so. A panel
+that lies on its side has rows and columns swapped first, which costs nothing. Images of
+an upright panel are returned as they are; a horizontal panel is an error.
 
 Grids for reconstruction: the field of view of a scan, and the rows that a slab of it needs.
 """

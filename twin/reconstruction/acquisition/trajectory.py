@@ -1,4 +1,4 @@
-"""What FDK must know of a scan: its circle, the angle each view stands for, and its redundancy.
+"""A scan's trajectory for FDK: its circle, the arc of each view, and its redundancy.
 
 Any flat panel on a circle about an axis parallel to z: any number of turns and parts of turns with
 any gaps, as long as the views see every line through the object, a detector moved to one side, and
@@ -55,11 +55,11 @@ class Circle:
     Attributes:
         centre: (x, y) of the rotation axis [mm].
         radius: from the axis to the source [mm].
-        angle: (n,) along it [rad]: on a circle the azimuth of the source about the axis, from 0 to
-            2 pi; on a helix since its lowest view.
-        step: (n,) angle each view stands for [rad].
-        gaps: (k, 2) first and last angle of the arcs that no view stands for [rad]; the last may
-            lie beyond 2 pi. A helix has none.
+        angle: (n,) along it [rad]: on a circle the azimuth of the source about the axis,
+            from 0 to 2 pi; on a helix since its lowest view.
+        step: (n,) arc of each view [rad].
+        gaps: (k, 2) first and last angle of the arcs without views [rad]; the last may
+            exceed 2 pi. A helix has no gaps.
         rise: of a helix in a turn [mm]; 0 for a circle.
     """
 
@@ -246,9 +246,9 @@ def narrow_overlap(circle: Circle, cone_vec: ConeVec, cols: int) -> bool:
 def axis_between(circle: Circle, cone_vec: ConeVec, shape: tuple[int, int]) -> ConeVec:
     """Move panels by up to a quarter of a column: the axis is on a column or between two.
 
-    Where the weights of a ray and its opposite change within few columns, what they add
-    to the filtered rows is large, odd about the axis, and cancels only if both are
-    sampled alike.
+    Where the weights of a ray and its opposite change within few columns, the weights'
+    contribution to the filtered rows is large, odd about the axis, and cancels only if
+    both are sampled alike.
     """
     at = cone_vec.project_points([[*circle.centre, 0.0]], shape)[:, 0, 0]
     moved = np.round(2.0 * at) / 2.0 - at

@@ -1,12 +1,12 @@
-"""What lies beyond the edges of a panel that is narrower than the object's shadow.
+"""Estimate of the object beyond the edges of a panel that is narrower than its shadow.
 
-The ramp filter needs whole projections. Where the object goes on beyond the panel, an elliptic
-prism is fitted to what all views saw of it, for each band of rows, and rows are continued by its
-path lengths. One shape for all views is what makes the continuations agree with each other. Other
-materials in the object deviate from the prism and count less and less in a robust fit, which
-follows the quarter of the rays that fits best. Where even that quarter deviates by more than noise
-does, the outline is no ellipse, or too much else is in it: rows then fade out smoothly beyond the
-panel, and `bias_bound` has what that may change.
+The ramp filter needs complete projections. If the object continues beyond the panel, an
+elliptic prism is fitted to the images, for each band of rows, and rows are continued by
+its path lengths. One shape for all views makes the continuations agree with each other.
+Other materials in the object deviate from the prism and count less and less in a robust
+fit, which follows the quarter of the rays that fits best. Where even that quarter
+deviates by more than noise does, the outline is no ellipse, or too much else is in it:
+rows then fade out smoothly beyond the panel, and `bias_bound` has what that may change.
 """
 
 from __future__ import annotations
@@ -120,11 +120,11 @@ class Truncation:
 
     Attributes:
         rows: (b,) middle row of each band.
-        prisms: one a band; None where rows are whole, or fade out.
+        prisms: one a band; None where rows are complete, or fade out.
         cut_off: (b,) whether the band's rows are continued.
-        others: the best of the prisms that do not explain what was seen, where none does.
+        others: the best prisms that do not explain the images, where no prism does.
         fade: length over which rows fade out that no prism explains, over that of a row.
-        beyond: whether no prism stands for what a panel moved to one side misses.
+        beyond: whether the part missed by a panel moved to one side has no prism.
     """
 
     rows: FloatArray
@@ -212,11 +212,12 @@ class Continuation:
     `truncation_kernels.continue_rows`.
 
     Attributes:
-        edge: columns at an edge whose mean goes on.
-        plane: (n, 6) source, ray to the first column and step between columns, x and y [mm].
-        prisms: (b, 6) numbers of each band's; zeros for none.
+        edge: columns at an edge whose mean is continued.
+        plane: (n, 6) source, ray to the first column and step between columns, x and y
+            [mm].
+        prisms: (b, 6) numbers of each band's prism; zeros without one.
         band, share: (rows,) lower band of each row, and how much the next one counts.
-        cut: (rows,) how much of what the prisms leave at the edges goes on.
+        cut: (rows,) share of the prisms' residual at the edges that is continued.
         fade: (columns,) part of it that is left in each column.
     """
 

@@ -1,1 +1,1 @@
-"""Whether the images of a scan fit its geometry, and what would explain that they do not."""
+"""Agreement of a scan's images with its geometry, and explanations of a contradiction."""

@@ -43,7 +43,7 @@ TELLING: Final = 0.3
 """Residual of the second reconstruction, over the images, below which it is reliable:
 one of few views or few columns beyond the axis has larger ones."""
 FEWEST_VIEWS: Final = 1.6
-"""Views for a coarse column, below which streaks hide what does not fit."""
+"""Least views for a coarse column; with fewer, streaks hide contradictions."""
 LEAST: Final = 12
 """Least number of views and coarse columns; with fewer a volume fits anything and no
 result is given."""
@@ -71,8 +71,8 @@ class Contradiction:
     """A contradiction between images and their geometry.
 
     Attributes:
-        misfit: residual over what it should be.
-        kinds: of `suspects.KINDS`, what explains it best; none where nothing does.
+        misfit: residual over its expected value.
+        kinds: of `suspects.KINDS`, the best explanation; empty without one.
         better: misfit that the best explanation leaves, over `misfit`; 1 without one.
         figures: of the kinds.
     """
@@ -104,7 +104,7 @@ def contradiction_of(scan: CoarseScan) -> Contradiction | None:
         scan: coarse; some of its views and rows are compared.
 
     Returns:
-        None where they fit, of helices, and of scans of too few views or columns to tell.
+        None if they fit, for helices, and for scans of too few views or columns.
     """
     if scan.circle.rise or min(len(scan.circle.step), scan.images.shape[2]) < LEAST:
         return None
@@ -122,7 +122,7 @@ class _Tried:
     Attributes:
         suspect: the explanation.
         shown: its images, and its volume's; None where FDK cannot use its geometry.
-        score: its misfit over that of the scan as it is said to be.
+        score: its misfit over that of the scan's stated geometry.
     """
 
     suspect: Suspect

@@ -1,10 +1,10 @@
 """Pixels that do not respond as their neighbours do: dead, stuck, hot and flickering ones.
 
-An object turns, so that what it gives to a pixel beyond its neighbours in the row it gives in few
-views. A pixel that lies beyond them by far more than other pixels do, in the root of the mean
-square over all but a few views, is a bad one; so is a column of such pixels. Near the rotation axis
-an object hardly moves: there a pixel must lie beyond its neighbours in the column, too, or the
-whole column is bad.
+An object turns, so that what it gives to a pixel beyond its neighbours in the row it
+gives in few views. A pixel that is beyond them by far more than other pixels, in the root
+of the mean square over all but a few views, is a bad one; so is a column of such pixels.
+Near the rotation axis an object hardly moves: there a pixel must also be beyond its
+neighbours in the column, or the complete column is bad.
 """
 
 from __future__ import annotations
@@ -83,12 +83,13 @@ def bad_pixels(views: Callable[[], Iterable[Float32Array]], axis_column: float) 
     """Find pixels that do not respond as their neighbours do.
 
     Args:
-        views: gives line integrals of some views of a scan, (rows, cols) each; called twice where
-            there are bad ones: the worst make their neighbours look bad, too.
+        views: gives line integrals of some views of a scan, (rows, cols) each; called
+            twice where there are bad ones: the worst make their neighbours look bad as
+            well.
         axis_column: where the axis falls.
 
     Returns:
-        None where there are none.
+        None if no pixel is bad.
     """
     first, response = _outliers(views(), axis_column)
     if not first.any():

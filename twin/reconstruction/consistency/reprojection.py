@@ -1,4 +1,4 @@
-"""A coarse volume projected again, beside the images that it was reconstructed from."""
+"""Comparison of a coarse volume's projections with the images it was reconstructed from."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Reprojection:
             scan: gives the grid.
             images: (n, rows, cols).
             cone_vec: n views.
-            truncation: what lies beyond their edges.
+            truncation: object beyond their edges.
 
         Returns:
             None where FDK cannot use the geometry.

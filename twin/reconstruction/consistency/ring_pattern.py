@@ -1,12 +1,14 @@
-"""What single pixels add to all views, which FDK makes rings of, told from object and noise.
+"""Errors of single pixels in all views, from which FDK makes rings, separated from object
+and noise.
 
-In each view a pixel is compared with its neighbours in the row. What stays the same in the medians
-of groups of views is the pixel's error, or an object that hardly moves about the rotation axis. In
-a full turn columns at equal distances on both sides of the axis see the same rays, so that what an
-object adds is alike on both sides, and mostly alike in neighbouring rows; what pixels add is not.
-How far the groups lie apart is the noise. An error is subtracted as far as it stands out from both
-(Wiener's filter, by block): of a panel without errors nothing is. Equal errors of two columns as
-far from the axis are taken for the object.
+In each view a pixel is compared with its neighbours in the row. The constant part of the
+medians of groups of views is the pixel's error, or an object that hardly moves about the
+rotation axis. In a full turn columns at equal distances on both sides of the axis see the
+same rays, so that an object's part is alike on both sides, and mostly alike in
+neighbouring rows; pixels' errors are not. The distance of the groups is the noise. An
+error is subtracted as far as it stands out from both (Wiener's filter, by block): of a
+panel without errors nothing is. Equal errors of two columns as far from the axis are
+taken for the object.
 """
 
 from __future__ import annotations
@@ -50,12 +52,13 @@ def ring_errors(
     axis_column: float | None = None,
     width: int = NEIGHBOURHOOD_COLS,
 ) -> Float32Array:
-    """Find what each pixel adds to all views, to be subtracted from each.
+    """Find each pixel's constant error, to be subtracted from all views.
 
     Args:
         views: (rows, cols) line integrals of all views, in order.
-        axis_column: where the axis falls, of a full turn; None where columns on both sides of it do
-            not see the same rays: then whole columns are left as they are.
+        axis_column: where the axis falls, of a full turn; None where columns on both
+            sides of it do not see the same rays: then complete columns are left
+            unchanged.
         width: columns of the neighbourhood.
 
     Returns:

@@ -1,4 +1,4 @@
-"""What may be wrong with a scan: images and geometries as they would be if it were."""
+"""Possible errors of a scan: images and geometries as each would make them."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Suspect:
         kind: of `KINDS`.
         images: (n, rows, cols).
         cone_vec: n views.
-        figure: what is right instead, in words; "" where the kind says all.
+        figure: the right value, in words; "" if the kind is enough.
     """
 
     kind: str

@@ -49,7 +49,7 @@ class Task:
         cone_vec: of all views.
         shape: detector (rows, cols).
         window: of the ramp filter.
-        truncation: what lies beyond the panel's edges; None for nothing.
+        truncation: object beyond the panel's edges; None for nothing.
         outside: keep voxels that only continued rows show from all sides.
         errors: find the noise.
     """

@@ -1,4 +1,4 @@
-"""What FDK knows of a scan and a grid before the first image: panels, widths, weights and filter.
+"""Preparation of FDK before the first image: panels, widths, weights and filter.
 
 `plan_fdk` works out the steps that all views share; `FdkPlan.views_of` takes the images of some
 views through those that images pass before the filter.
@@ -73,7 +73,7 @@ class Widths:
     """Rows and columns of the upright panel that are computed, counted from its first.
 
     Attributes:
-        first, last: rows in the grid's shadow, first <= r < last; they may lie off the
+        first, last: rows in the grid's shadow, first <= r < last; they may be off the
             panel.
         before, after: columns off the panel that go into the filter.
         near: columns off the panel on either side whose filtered values are needed.
@@ -127,7 +127,7 @@ class FdkPlan:
         response: of the filter.
         table: of all views, for the columns that are kept; see `fdk_kernels.backproject`.
         sharing: of the views of a helix; None for a circle.
-        truncation: what lies beyond the panel's edges; None for nothing.
+        truncation: object beyond the panel's edges; None for nothing.
     """
 
     like: Volume
@@ -215,7 +215,7 @@ def plan_fdk(
         shape: detector (rows, cols).
         like: the grid.
         window: of the ramp filter.
-        truncation: what lies beyond the panel's edges (`truncation_of`); None for nothing.
+        truncation: object beyond the panel's edges (`truncation_of`); None for nothing.
 
     Raises:
         GeometryError: no circle and no helix, too short a scan, too steep a helix, or rows of one
@@ -271,7 +271,7 @@ def _check_steady(circle: Circle, level: ConeVec, shape: tuple[int, int]) -> Non
     """Check that all views see the axis at about one column: redundancy is weighed by columns.
 
     Raises:
-        GeometryError: the panel goes sideways during the scan, as in a tiled one.
+        GeometryError: the panel moves sideways during the scan, as in a tiled one.
     """
     columns = level.project_points([[*circle.centre, 0.0]], shape)[:, 0, 0]
     moved = float(np.ptp(columns))
@@ -282,7 +282,7 @@ def _check_steady(circle: Circle, level: ConeVec, shape: tuple[int, int]) -> Non
 
 
 def _widths(circle: Circle, panels: Panels, like: Volume, truncation: Truncation | None) -> Widths:
-    """Find the rows and columns that a grid and what lies beyond the panel's edges need."""
+    """Find the rows and columns that a grid and the object beyond the panel's edges need."""
     level, cols = panels.upright, panels.shape[1]
     near = columns_beyond(circle, level, cols)
     far = (0, 0) if truncation is None else truncation.columns(level, cols)

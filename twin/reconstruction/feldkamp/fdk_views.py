@@ -82,7 +82,8 @@ class Views:
         return int(max(self.factors.shape[1] - self.kept.start, self.kept.stop))
 
     def prism_lengths(self) -> Float32Array:
-        """Compute what prisms add to rows beyond the panel's edges, (n, bands, columns) [1/mm].
+        """Compute the prisms' share of rows beyond the panel's edges, (n, bands, columns)
+        [1/mm].
 
         See `truncation_kernels.prism_lengths`.
         """
@@ -106,7 +107,9 @@ class Views:
 
 
 def view_table(cone_vec: ConeVec, shape: tuple[int, int]) -> FloatArray:
-    """Compute what the kernel needs of upright views, (n, 11); see `fdk_kernels.backproject`."""
+    """Compute the kernel's table of upright views, (n, 11); see
+    `fdk_kernels.backproject`.
+    """
     rows, cols = shape
     pitch_u = np.linalg.norm(cone_vec.u, axis=1)
     pitch_v = np.linalg.norm(cone_vec.v, axis=1)

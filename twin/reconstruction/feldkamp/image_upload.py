@@ -21,7 +21,7 @@ class ImageUpload:
     """Upload images and small tables on a stream of their own.
 
     Args:
-        stream: of the kernels that read what is uploaded.
+        stream: of the kernels that read the uploaded data.
     """
 
     def __init__(self, stream: Any) -> None:
@@ -72,7 +72,7 @@ class ImageUpload:
         return there
 
     def hand_over(self) -> None:
-        """Let the kernels that are launched from now on wait for what has been uploaded."""
+        """Let the kernels launched from now on wait for the uploads so far."""
         from numba import cuda
 
         done = cuda.event()

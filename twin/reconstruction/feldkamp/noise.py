@@ -46,10 +46,10 @@ class Noise:
     """Variances of the noise in a volume.
 
     Attributes:
-        views: of what differs between the views, on a coarse grid [1/mm^2].
+        views: variance of the views' own noise, on a coarse grid [1/mm^2].
         centre: of the circle [mm].
         radii: about it, growing [mm].
-        shared: at these radii, of what all views share [1/mm^2].
+        shared: variance common to all views at these radii [1/mm^2].
     """
 
     views: Volume

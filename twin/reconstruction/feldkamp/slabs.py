@@ -8,7 +8,7 @@ from flexdt.twin.projection import Volume
 
 
 def layers(volume: Volume, first: int, last: int) -> Volume:
-    """Take layers first <= z < last of a volume, where they lie; nothing is copied."""
+    """Take layers first <= z < last of a volume, as a view; nothing is copied."""
     x, y, z = volume.center_mm
     middle = z + ((first + last) / 2 - volume.shape[0] / 2) * volume.voxel_xyz[2]
     return replace(volume, data=volume.data[first:last], center_mm=(x, y, middle))

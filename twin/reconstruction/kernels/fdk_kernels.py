@@ -316,8 +316,8 @@ def _add_places(acc, image, rows, at, across, down, weight):
 
 @kernel
 def _add_few(acc, image, rows, g, x, y, z0, dx, dz, at, parts):
-    """Add one view to voxels beside one another, acc (nx, nz) from (x, y) on: for few rows, of
-    which whole registers would cost more than they bring."""
+    """Add one view to neighbouring voxels, acc (nx, nz) from (x, y) on: for few rows, for
+    which full registers would not pay."""
     n, cols = len(acc), len(image)
     y -= g[1]
     slope = dx * g[3]
@@ -369,10 +369,11 @@ def _entry_point(lanes: int):  # type: ignore[no-untyped-def]
 
         images: float32 (n, cols, rows and as many more as `room` says), contiguous.
         rows: of the images.
-        shares: float32 (n, depths, rows), what rows count in a helix; else (n, 0, 0).
-        views: float64 (n, 11): source x, y, z; unit normal x, y; unit u x, y; distance in pitches
-            of columns; column of the foot point; distance in pitches of rows; row of the foot
-            point; of a helix (n, 13): first depth of the shares, and how many a mm.
+        shares: float32 (n, depths, rows), weights of rows in a helix; else (n, 0, 0).
+        views: float64 (n, 11): source x, y, z; unit normal x, y; unit u x, y; distance in
+            pitches of columns; column of the foot point; distance in pitches of rows; row
+            of the foot point; of a helix (n, 13): first depth of the shares, and how many
+            a mm.
         x0..dz: centre of the first voxel and steps [mm].
         volume: float32 (ny, nx, nz), added to; a value counts with 1 / depth^2.
         workers: threads.

@@ -133,8 +133,8 @@ def weighted_pixel(
 ):
     """Compute a pixel of a widened row with FDK's weight; see `fdk_kernels.weigh`.
 
-    rests: what prisms leave at the low (2 `which`) and the high edge (2 `which` + 1) of
-    the row.
+    rests: residual of the prisms at the low (2 `which`) and the high edge (2 `which` + 1)
+    of the row.
     """
     slant = math.sqrt(across[view, c] + up[view, r])
     if c < before or c >= before + images.shape[2]:
@@ -157,10 +157,12 @@ def filter_rows(
 
     images: float32 (n, rows of the panel, cols); row `top` is the first that is needed.
     before: columns that go into the filter before the panel's first.
-    edge: columns at an edge whose mean goes on; 0 where no column lies beyond.
+    edge: columns at an edge whose mean is continued; 0 where no column is beyond.
     factors, across, up: float32 (n, wide), (n, wide), (n, rows) of `fdk_kernels.weigh`.
-    lengths, band, share, cut, fade: of `truncation_kernels.continue_rows`, float32 and int32.
-    response: float32 (length,) over the length, a power of 2, in the order of reversed bits.
+    lengths, band, share, cut, fade: of `truncation_kernels.continue_rows`, float32 and
+        int32.
+    response: float32 (length,) over the length, a power of 2, in the order of reversed
+        bits.
     cosines, sines: float32 (length / 2,) of 2 pi k / length.
     out: float32 (n, cols, rows), from column `start` of the filtered rows on.
     """

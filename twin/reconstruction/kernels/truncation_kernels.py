@@ -1,4 +1,4 @@
-"""An elliptic prism: its path lengths beyond a panel's edges, and its fit to what views saw.
+"""An elliptic prism: its path lengths beyond a panel's edges, and its fit to the views.
 
 Rows are continued on all cores, in one pass over the pixels, for the processor and for a device
 alike: of 360 views into 512^3 a device takes milliseconds a view, this a fraction of one, and what
@@ -76,12 +76,12 @@ def prism_lengths(before, cols, edge, plane, prisms, out):
     """Compute the horizontal path lengths times attenuation of prisms beyond a panel's edges.
 
     before, cols: columns before the panel's first, and of the panel.
-    edge: columns at an edge whose mean goes on.
-    plane: (n, 6) source, ray to the first column of `out`, and step from column to column, x and y
-        [mm].
+    edge: columns at an edge whose mean is continued.
+    plane: (n, 6) source, ray to the first column of `out`, and step from column to
+        column, x and y [mm].
     prisms: (k, 6) of `_chord`.
-    out: float32 (n, k, wide), over the horizontal length of the ray [1/mm]; 0 in columns of the
-        panel that are not at an edge.
+    out: float32 (n, k, wide), over the horizontal length of the ray [1/mm]; 0 in columns
+        of the panel that are not at an edge.
     """
     n, bands, wide = out.shape
     after = before + cols
@@ -104,10 +104,10 @@ def continue_rows(images, first, before, edge, lengths, band, share, cut, fade, 
     first: row of the panel that is the first of `out`; rows beyond it repeat its
     outermost ones.
     before: columns of `out` before the panel's first.
-    edge: columns at an edge whose mean goes on.
+    edge: columns at an edge whose mean is continued.
     lengths: (n, bands, wide) of `prism_lengths`.
     band, share: (rows,) lower band of each row, and how much the next one counts.
-    cut: (rows,) how much of what the prisms leave at the edges goes on.
+    cut: (rows,) share of the prisms' residual at the edges that is continued.
     fade: (wide,) part of it that is left in each column.
     across, up: squares of the ray's horizontal and vertical parts, (n, wide) and (n,
     rows) [mm^2].
