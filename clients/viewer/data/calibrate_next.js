@@ -1,4 +1,5 @@
-// What a calibration proposes next, as a button where the page can do it; its command stays for a shell.
+// What a calibration proposes next, as a button where the page can do it; its command stays
+// for a shell.
 import { $button, $select, el } from "./dom.js";
 import { emit } from "./link.js";
 function composed() {
@@ -21,6 +22,8 @@ export function nextOf(line, actions) {
 }
 export function nextStep(line, actions) {
     const next = nextOf(line, actions);
-    const command = el("details", {}, el("summary", { class: "muted" }, "as a command"), el("code", {}, line));
-    return el("div", {}, next ? el("button", { class: "small", onclick: next.act }, next.words) : null, command);
+    const summary = el("summary", { class: "muted" }, "as a command");
+    const command = el("details", {}, summary, el("code", {}, line));
+    const button = next && el("button", { class: "small", onclick: next.act }, next.words);
+    return el("div", {}, button, command);
 }

@@ -1,9 +1,13 @@
-// A radiograph as a picture that explains itself: scale at the sample, unit and window, when and of what.
+// A radiograph as a picture that explains itself: scale at the sample, unit and window, when
+// and of what.
 import { bar } from "./slices.js";
 import { fixed } from "./dom.js";
 import { store } from "./link.js";
 const STRIP_PX = 44;
-const UNITS = { line_integral: "line integral (no unit)", counts: "counts" };
+const UNITS = {
+    line_integral: "line integral (no unit)",
+    counts: "counts",
+};
 function loaded(url) {
     return new Promise((resolve, reject) => {
         const image = new Image();
@@ -19,8 +23,10 @@ function lines() {
     const recorded = shown?.recorded;
     const unit = UNITS[shown?.kind ?? ""] ?? "";
     const window = shown ? `${fixed(shown.window[0], 2)} to ${fixed(shown.window[1], 2)}` : "";
-    const what = recorded ? `${recorded.name}, ${recorded.file}` : (state?.sample.name ?? "no sample");
-    const beam = state && !recorded ? ` · ${fixed(state.tube.kV, 0)} kV, ${fixed(state.tube.power_W, 0)} W` : "";
+    const sample = state?.sample.name ?? "no sample";
+    const what = recorded ? `${recorded.name}, ${recorded.file}` : sample;
+    const tube = recorded ? null : state?.tube;
+    const beam = tube ? ` · ${fixed(tube.kV, 0)} kV, ${fixed(tube.power_W, 0)} W` : "";
     const when = new Date().toISOString().slice(0, 16).replace("T", " ");
     return [`${unit}, window ${window}`, `${what}${beam} · ${when} UTC · flexdt`];
 }

@@ -4,7 +4,11 @@ import { emit } from "./link.js";
 import { open as openStory } from "./story.js";
 const tab = (name) => () => emit("show-tab", name);
 const TASKS = [
-    ["See a volume of the sample", "one turn, its volume, its truth", () => $button("#scan-it").click()],
+    [
+        "See a volume of the sample",
+        "one turn, its volume, its truth",
+        () => $button("#scan-it").click(),
+    ],
     ["Put another sample on the stage", "a shipped one, or a mesh of yours", tab("setup")],
     ["Change voltage, exposure or filters", "and see what they do to the image", tab("setup")],
     ["Move source, sample or detector", "by magnification, voxel size or motor", tab("move")],

@@ -14,7 +14,8 @@ export function ticks(low, high, wished) {
     const first = Math.ceil(low / step - 1e-9);
     const last = Math.floor(high / step + 1e-9);
     const places = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
-    return Array.from({ length: last - first + 1 }, (_, k) => Number(((first + k) * step).toFixed(places)));
+    const tick = (k) => Number(((first + k) * step).toFixed(places));
+    return Array.from({ length: last - first + 1 }, (_, k) => tick(k));
 }
 function pen(canvas) {
     const context = canvas.getContext("2d");
@@ -47,7 +48,8 @@ export function below(canvas, low, high, unit) {
         const x = (width * (value - low)) / (high - low);
         context.fillRect(x, height - TICK_PX * scale, scale, TICK_PX * scale);
         const half = context.measureText(String(value)).width / 2;
-        if (x > half && x < width - half - 60 * scale)
+        const fits = x > half && x < width - half - 60 * scale;
+        if (fits)
             written(context, String(value), x, height - TICK_PX * scale);
     }
     context.textAlign = "right";

@@ -5,7 +5,11 @@ import { open as openStory } from "./story.js";
 
 const tab = (name: string) => () => emit("show-tab", name);
 const TASKS: Array<[wish: string, how: string, act: () => unknown]> = [
-  ["See a volume of the sample", "one turn, its volume, its truth", () => $button("#scan-it").click()],
+  [
+    "See a volume of the sample",
+    "one turn, its volume, its truth",
+    () => $button("#scan-it").click(),
+  ],
   ["Put another sample on the stage", "a shipped one, or a mesh of yours", tab("setup")],
   ["Change voltage, exposure or filters", "and see what they do to the image", tab("setup")],
   ["Move source, sample or detector", "by magnification, voxel size or motor", tab("move")],

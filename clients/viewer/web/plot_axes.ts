@@ -14,7 +14,8 @@ export function ticks(low: number, high: number, wished: number): number[] {
   const first = Math.ceil(low / step - 1e-9);
   const last = Math.floor(high / step + 1e-9);
   const places = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
-  return Array.from({ length: last - first + 1 }, (_, k) => Number(((first + k) * step).toFixed(places)));
+  const tick = (k: number) => Number(((first + k) * step).toFixed(places));
+  return Array.from({ length: last - first + 1 }, (_, k) => tick(k));
 }
 function pen(canvas: HTMLCanvasElement): CanvasRenderingContext2D | null {
   const context = canvas.getContext("2d");
@@ -45,7 +46,8 @@ export function below(canvas: HTMLCanvasElement, low: number, high: number, unit
     const x = (width * (value - low)) / (high - low);
     context.fillRect(x, height - TICK_PX * scale, scale, TICK_PX * scale);
     const half = context.measureText(String(value)).width / 2;
-    if (x > half && x < width - half - 60 * scale) written(context, String(value), x, height - TICK_PX * scale);
+    const fits = x > half && x < width - half - 60 * scale;
+    if (fits) written(context, String(value), x, height - TICK_PX * scale);
   }
   context.textAlign = "right";
   written(context, unit, width - 3 * scale, height - TICK_PX * scale);

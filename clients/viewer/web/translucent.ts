@@ -1,6 +1,7 @@
-// Runs in each viser frame, and in exported scenes, before viser. What is drawn translucent writes no depth: viser
-// (1.1) gives images and translucent meshes materials that do, three.js draws them in the order of their nodes'
-// origins, and a sheet of the beam that is drawn first then hides the sample behind it.
+// Runs in each viser frame, and in exported scenes, before viser. What is drawn translucent
+// writes no depth: viser (1.1) gives images and translucent meshes materials that do,
+// three.js draws them in the order of their nodes' origins, and a sheet of the beam that is
+// drawn first then hides the sample behind it.
 (() => {
   const gl = WebGL2RenderingContext.prototype;
   const blending = new WeakSet<WebGL2RenderingContext>();
