@@ -94,7 +94,7 @@ KNOWN: Final[Mapping[str, str]] = {
 installed: an entry point is looked up when its command is on the command line."""
 NUMBERS_WITH_SIGN: Final = ("jog", "clock")
 """Commands whose arguments may begin with a minus."""
-ALONE: Final = ("twin", "projector", "viewer", "gateway")
+PROCESS_COMMANDS: Final = ("twin", "projector", "viewer", "gateway")
 """Commands that pass their words on to a process, `--help` among them."""
 SECTIONS: Final[Mapping[str, tuple[str, ...]]] = {
     "Scanner": ("state", "move", "jog", "stop", "estop", "reset", "tube", "camera", "clock",
@@ -102,22 +102,22 @@ SECTIONS: Final[Mapping[str, tuple[str, ...]]] = {
     "Scans": ("script", "check", "expose", "run", "job", "follow"),
     "Data": ("calibrate", "align", "compare", "reconstruct", "export", "import", "simulate"),
     "Analysis": ("phantom", "machine", "commission", "study", "batch", "bench", "evidence"),
-    "Processes": ("up", *ALONE, "demo", "doctor"),
+    "Processes": ("up", *PROCESS_COMMANDS, "demo", "doctor"),
 }  # fmt: skip
 """Sections of the help page; commands in none of them are listed under Extensions."""
 
 
-OWN: Final[Mapping[str, str]] = {
+COMMON: Final[Mapping[str, str]] = {
     "--json": "--json", "--server": "--server HOST:PORT", "--token-file": "--token-file FILE",
     "--quiet": "--quiet", "-q": "-q", "--verbose": "--verbose", "-v": "-v",
 }  # fmt: skip
 """Options of `flexdt` itself that may also follow the command's name, as help pages show them."""
-WITH_VALUE: Final = ("--server", "--token-file")
-"""Options of `OWN` that a value follows."""
+OPTIONS_WITH_VALUE: Final = ("--server", "--token-file")
+"""Options of `COMMON` that a value follows."""
 
 
 def own_first(words: Sequence[str], flags: Collection[str]) -> tuple[list[str], list[str]]:
-    """Split words into these options of `OWN`, with their values, and the other words."""
+    """Split words into these options of `COMMON`, with their values, and the other words."""
     first, rest = list[str](), list[str]()
     more = iter(words)
     for word in more:
@@ -127,24 +127,24 @@ def own_first(words: Sequence[str], flags: Collection[str]) -> tuple[list[str], 
             rest.append(word)
         else:
             first.append(word)
-            first += islice(more, 1 if word in WITH_VALUE else 0)
+            first += islice(more, 1 if word in OPTIONS_WITH_VALUE else 0)
     return first, rest
 
 
 class InSections(TyperGroup):
-    """Lists its commands in `SECTIONS`, and takes `OWN` wherever they are on the command line."""
+    """Lists its commands in `SECTIONS`, and takes `COMMON` anywhere on the command line."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Put the options of `flexdt` itself that the command heeds before its name."""
         command: Any = self
-        for word in own_first(args, OWN)[1]:
+        for word in own_first(args, COMMON)[1]:
             if word[:1] != "-" and hasattr(command, "commands"):
                 command = command.commands.get(word)
         heeds = getattr(getattr(command, "callback", None), "heeds", ())
         first, rest = own_first(args, heeds)
-        if first and first[-1] in WITH_VALUE:
+        if first and first[-1] in OPTIONS_WITH_VALUE:
             ctx.fail(f"Option '{first[-1]}' requires an argument.")
-        if command not in (None, self) and rest[0].partition("=")[0] in OWN:
+        if command not in (None, self) and rest[0].partition("=")[0] in COMMON:
             ctx.fail(f"{rest[0].partition('=')[0]} is no option of `flexdt {command.name}`")
         return list(super().parse_args(ctx, [*first, *rest]))
 
@@ -194,12 +194,12 @@ def build(words: Sequence[str] | None = None) -> typer.Typer:
         speak(quiet=verbose is False, verbose=verbose is True)
 
     for name, command in COMMANDS.items():
-        passes = name == "up" or name in ALONE
+        passes = name == "up" or name in PROCESS_COMMANDS
         context: dict[str, Any] = {
             "ignore_unknown_options": name in NUMBERS_WITH_SIGN or passes,
             "allow_extra_args": passes,
         }
-        if name in ALONE:
+        if name in PROCESS_COMMANDS:
             context["help_option_names"] = []
         _add(app, name, command, context)
     groups = {}
@@ -247,7 +247,7 @@ def _add_others(
     if words is None:
         asked = [*KNOWN]
     else:
-        first, second = [*own_first(words, OWN)[1], "", ""][:2]
+        first, second = [*own_first(words, COMMON)[1], "", ""][:2]
         asked = [f"{first} {second}" if first in GROUPS else first]
     ours = {*COMMANDS, *(f"{group} {one}" for group, (_, more) in GROUPS.items() for one in more)}
     asked = [name for name in asked if name not in ours and name and name.split()[-1][0] != "-"]
@@ -267,7 +267,7 @@ def _add(app: typer.Typer, name: str, command: Callable[..., Any], context: Any 
     """Add a command; its help page ends with the options of `flexdt` that it heeds."""
     complete, heeds = completed(command)
     complete.heeds = heeds  # type: ignore[attr-defined]
-    also = f"Also, of flexdt itself: {', '.join(OWN[flag] for flag in heeds)}" if heeds else None
+    also = f"Also, of flexdt itself: {', '.join(COMMON[flag] for flag in heeds)}" if heeds else None
     app.command(name, context_settings=context, epilog=also)(complete)
 
 
@@ -279,8 +279,8 @@ def _version(asked: bool) -> None:
         raise typer.Exit
 
 
-RETIRED = ("backup", "restore")
-COMPLETING = "_FLEXDT_COMPLETE"
+REMOVED_COMMANDS = ("backup", "restore")
+COMPLETION_VARIABLE = "_FLEXDT_COMPLETE"
 
 
 def run(argv: Sequence[str]) -> int:
@@ -309,13 +309,13 @@ def _run(argv: Sequence[str]) -> int:
         The exit code.
     """
     printable()
-    if argv and argv[0] in RETIRED:
+    if argv and argv[0] in REMOVED_COMMANDS:
         note(
             f"flexdt {argv[0]}: has been removed; the data directory of a stopped twin is an "
             "ordinary folder: `tar -cf ARCHIVE.tar DIR` copies it, `tar -xf ARCHIVE.tar` unpacks it"
         )
         return USAGE
-    completing = COMPLETING in os.environ  # a shell requests completions
+    completing = COMPLETION_VARIABLE in os.environ  # a shell requests completions
     command = get_command(build(None if completing else argv))
     if completing:
         command.main(list(argv), prog_name="flexdt")

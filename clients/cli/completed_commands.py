@@ -20,11 +20,11 @@ from flexdt.clients.cli.twin_connection import connect
 from flexdt.runtime.files.writable import require_writable
 from flexdt.runtime.settings import described, has_parameters
 
-GIVEN: Final = ("context", "twin", "json")
+FILLED_PARAMETERS: Final = ("context", "twin", "json")
 """Parameters of commands that are filled in, not options."""
 
 
-TALK: Final = ("--quiet", "-q", "--verbose", "-v")
+VERBOSITY_OPTIONS: Final = ("--quiet", "-q", "--verbose", "-v")
 """Options of `flexdt` that all of these commands obey."""
 
 
@@ -70,11 +70,11 @@ def completed(command: Callable[..., Any]) -> tuple[Callable[..., None], tuple[s
 
     complete.__doc__ = about
     context = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
-    offered = (_with_choices(p) for name, p in own.items() if name not in GIVEN)
+    offered = (_with_choices(p) for name, p in own.items() if name not in FILLED_PARAMETERS)
     has_parameters(complete, [context, *offered])
     heeds = ("--json",) if yields or "json" in own else ()
     reaches = ("--server", "--token-file") if "twin" in own else ()
-    return complete, (*heeds, *reaches, *TALK)
+    return complete, (*heeds, *reaches, *VERBOSITY_OPTIONS)
 
 
 def _with_choices(parameter: inspect.Parameter) -> inspect.Parameter:

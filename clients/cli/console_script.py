@@ -31,7 +31,7 @@ INTERRUPTED = 130
 LINE = b"flexdt: interrupted\n"
 STUCK_S = 0.4
 """Time from the signal to the end of a process whose main thread has not reacted [s]."""
-IMPORTING = "<frozen importlib._bootstrap>"
+IMPORT_FILE = "<frozen importlib._bootstrap>"
 
 _heard = 0
 """Number of signals that the main thread has handled."""
@@ -50,7 +50,7 @@ def _interrupt(number: int, frame: object) -> None:
     global _heard
     _heard += 1
     while frame is not None:
-        if frame.f_code.co_filename == IMPORTING:  # type: ignore[attr-defined]
+        if frame.f_code.co_filename == IMPORT_FILE:  # type: ignore[attr-defined]
             leave()
         frame = frame.f_back  # type: ignore[attr-defined]
     raise KeyboardInterrupt

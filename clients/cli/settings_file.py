@@ -80,7 +80,7 @@ TABLES: Final[Mapping[str, type[Settings]]] = {
     )
 }  # fmt: skip
 """Tables of the file, and the settings of their keys."""
-ELSEWHERE: Final[Mapping[str, str]] = {"doctor": "up"}
+SHARED_TABLES: Final[Mapping[str, str]] = {"doctor": "up"}
 """Commands that read the table of another one."""
 KEYS: Final = {
     f.name: f.metadata["details"]["metavar"] for f in fields(Configuration) if f.metadata
@@ -215,7 +215,7 @@ def home_of(command: str, flag: str) -> str | None:
     """Return the place in the file of a former option `flag`; None if the file has no
     such key."""
     name = "_".join(command.split()[1:])
-    table, key = ELSEWHERE.get(name, name), flag.lstrip("-").replace("-", "_")
+    table, key = SHARED_TABLES.get(name, name), flag.lstrip("-").replace("-", "_")
     if table not in TABLES or key not in {f.name for f in fields(TABLES[table])}:
         return None
     return f"`{key}` in [{table}] of {config_file(os.environ)}"

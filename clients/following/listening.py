@@ -23,14 +23,14 @@ from flexdt.protocol.acquila import MAX_BYTES
 
 TICK_S: Final = 0.1
 PORT: Final = 50000
-LOST: Final = "the scanner has ended the connection, or does not answer"
+LOST_MESSAGE: Final = "the scanner has ended the connection, or does not answer"
 POLL_S: Final = 0.02
 HEARTBEAT_MS: Final = 200
 SILENT_MS: Final = 500
 """Longest time without an answer to a heartbeat before the scanner counts as lost
 [ms]."""
 RETRY_MS: Final = 100
-MOST_RETRY_MS: Final = 1000
+MAX_RETRY_MS: Final = 1000
 MAX_HELD: Final = 10_000
 _ADDRESS: Final = re.compile(r"(?:tcp://)?(\[[0-9a-fA-F:.]+\]|[^\s:/\[\]]+)(?::(\d{1,5}))?/?")
 
@@ -93,7 +93,7 @@ async def listen(
             if monitor in found:
                 happened = parse_monitor_message(monitor.recv_multipart())["event"]
                 up = happened == zmq.EVENT_HANDSHAKE_SUCCEEDED
-                tell(link, up, "" if up else LOST)
+                tell(link, up, "" if up else LOST_MESSAGE)
             with suppress(zmq.Again):
                 while True:
                     data = socket.recv_multipart(zmq.NOBLOCK)[-1]
@@ -106,7 +106,7 @@ async def listen(
             for option, value in (
                 (zmq.LINGER, 0), (zmq.RCVHWM, MAX_HELD), (zmq.MAXMSGSIZE, MAX_BYTES),
                 (zmq.HEARTBEAT_IVL, HEARTBEAT_MS), (zmq.HEARTBEAT_TIMEOUT, SILENT_MS),
-                (zmq.RECONNECT_IVL, RETRY_MS), (zmq.RECONNECT_IVL_MAX, MOST_RETRY_MS),
+                (zmq.RECONNECT_IVL, RETRY_MS), (zmq.RECONNECT_IVL_MAX, MAX_RETRY_MS),
                 (zmq.IPV6, int("[" in address)),
             ):  # fmt: skip
                 socket.setsockopt(option, value)

@@ -20,7 +20,7 @@ from flexdt.twin.script.parse import CodeLine, read_script, rows
 
 Key = tuple[str, str]
 MOVE: Final = "move absolute"
-ACTIVE: Final = ("running", "paused")
+ACTIVE_STATES: Final = ("running", "paused")
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ class Echoes:
             self._script = None if text is None else script_lines(text)
         if status.job != self._job or self._script is None:
             return
-        over = status.state not in (*ACTIVE, "queued")
+        over = status.state not in (*ACTIVE_STATES, "queued")
         reached = len(self._script) if status.state == "done" else 1 + (status.step or 0)
         if status.step is None and status.state != "done":
             reached = self._next

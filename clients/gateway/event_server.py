@@ -57,7 +57,7 @@ HANDSHAKE_MS: Final = 3000
 """Time limit for the handshake of a connection [ms]: where 167 come a second, 500 are
 open. ZeroMQ's own is 30 s."""
 PAUSE_S: Final = 0.1
-ALWAYS: Final = frozenset({"stop", "abort script"})
+URGENT_COMMANDS: Final = frozenset({"stop", "abort script"})
 
 
 class Gateway:
@@ -147,7 +147,7 @@ class Gateway:
         key = (event.uuid, event.tick_count)
         if key in self._running:
             return  # an echo of a command that runs already
-        most = MAX_RUNNING * (2 if event.command.lower() in ALWAYS else 1)
+        most = MAX_RUNNING * (2 if event.command.lower() in URGENT_COMMANDS else 1)
         if len(self._running) >= most:
             why = f"{most} commands are under way already; wait for one of them to end"
             self._send(event.answer(ReplyType.ERR, why))

@@ -26,7 +26,7 @@ Verdict = Literal["ok", "warning", "error"]
 WORST_ERROR: Final = 1e-5
 """Largest allowed deviation of the float32 kernels from the closed form, relative to
 its maximum."""
-LITTLE_ROOM: Final = 5 << 30
+LITTLE_ROOM_BYTES: Final = 5 << 30
 SLOW_SYNC_S: Final = 0.05
 
 
@@ -197,7 +197,7 @@ def disk(data: Path) -> CheckOutcome:
         )
     free = free_bytes(folder)
     found = f"{folder}: {free / 2**30:.1f} GiB free, 1 MiB reaches the disk in {1000 * took:.1f} ms"
-    if free < LITTLE_ROOM:
+    if free < LITTLE_ROOM_BYTES:
         return CheckOutcome("disk", "warning", found, "a scan of 1500 frames takes 2 to 4 GiB")
     if took > SLOW_SYNC_S:
         return CheckOutcome("disk", "warning", found, "slow; scans at full speed will wait for it")

@@ -23,7 +23,7 @@ ANSWERED: Final = 64
 and views."""
 MAX_HELD: Final = 256 << 20
 """Largest size of unfinished messages, of all connections together [bytes]."""
-FAIR: Final = 1 << 20
+FAIR_BYTES: Final = 1 << 20
 """Size up to which a connection's unfinished message is never dropped for those of
 others [bytes]."""
 
@@ -75,7 +75,7 @@ class BrowserConnection(ServerConnection):
     def data_received(self, data: bytes) -> None:
         """Take bytes, unless it and all together hold too many."""
         self._hold(self._held + len(data))
-        if self._admission.held > MAX_HELD and self._held > FAIR:
+        if self._admission.held > MAX_HELD and self._held > FAIR_BYTES:
             self.transport.abort()
         else:
             super().data_received(data)

@@ -43,7 +43,7 @@ COOKIE: Final = "flexdt_viewer"
 MAX_FROM_PAGE: Final = 16 << 20
 """Largest message of a browser [bytes]: a script of 8 MiB as JSON, a piece of an
 upload, a picture."""
-LAST: Final = {"Connection": "close"}
+CLOSE_HEADER: Final = {"Connection": "close"}
 """Header of plain answers: websockets closes after them; a client without it would
 send its next request to a closed connection."""
 SILENT_S: Final = 60.0
@@ -389,7 +389,7 @@ def _kept(request: Request, body: bytes, kind: str, how_long: str = "no-cache") 
     """Make a response that a browser may keep: sent again only where it has changed,
     and packed."""
     tag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
-    more = {"ETag": tag, "Cache-Control": how_long, "Vary": "Accept-Encoding", **LAST}
+    more = {"ETag": tag, "Cache-Control": how_long, "Vary": "Accept-Encoding", **CLOSE_HEADER}
     if tag in request.headers.get("If-None-Match", ""):
         return Response(http.HTTPStatus.NOT_MODIFIED.value, "Not Modified", Headers(more), b"")
     if "gzip" in request.headers.get("Accept-Encoding", ""):
@@ -424,7 +424,7 @@ def _response(
             "Content-Security-Policy": POLICY,
             "X-Content-Type-Options": "nosniff",
             "Referrer-Policy": "no-referrer",
-            **LAST,
+            **CLOSE_HEADER,
             **(more or {}),
         }
     )

@@ -48,7 +48,7 @@ TRY_AGAIN: Final = 1013
 ON_THE_WAY: Final = {"state": 2, "image": 3, "volume": 1}
 """Largest number of states, parts of images, and slices, that the page has not
 acknowledged yet."""
-TOOK: Final = {f'{{"took":"{slot}"}}': slot for slot in ON_THE_WAY}
+ACKNOWLEDGEMENTS: Final = {f'{{"took":"{slot}"}}': slot for slot in ON_THE_WAY}
 """A page's acknowledgements."""
 PART_BYTES: Final = 10_240
 """Size of a part of an image [bytes]. Three hold most images in motion, and are an
@@ -143,7 +143,7 @@ class Page:
             async for message in self._connection:
                 if not isinstance(message, str):
                     continue
-                if (slot := TOOK.get(message)) is not None:
+                if (slot := ACKNOWLEDGEMENTS.get(message)) is not None:
                     self._took(slot)
                 else:
                     self._start(self._handle(message), "a page's request")

@@ -23,10 +23,10 @@ from flexdt.clients.viewer.scenes.world import MM
 from flexdt.clients.viewer.viser_gate import Scenes, set_nodes
 from flexdt.twin.geometry.conventions import FloatArray
 
-FILLS = 1.3
+FAR_RATIO = 1.3
 """Distance of the camera, over the distance at which the ball in view fills the
 picture."""
-TOUCHED = 0.005
+MOVED_SHARE = 0.005
 """Displacement of a camera, as a part of its distance, from which it counts as moved
 by a person."""
 
@@ -142,7 +142,7 @@ class SceneClients:
         for client in self.of(page, view):
             aspect = client.camera.aspect
             preset = self.cameras[view].at(aspect)
-            far = FILLS * radius_mm * MM / math.sin(preset.fov / 2) / min(1.0, max(aspect, 0.3))
+            far = FAR_RATIO * radius_mm * MM / math.sin(preset.fov / 2) / min(1.0, max(aspect, 0.3))
             way = np.subtract(preset.position, preset.look_at)
             middle = at * MM
             x, y, z = (middle + far * way / np.linalg.norm(way)).tolist()
@@ -179,7 +179,7 @@ class SceneClients:
             return False
         reach_m = math.dist(put.position, put.look_at)
         apart_m = math.dist(put.position, tuple(client.camera.position))
-        return apart_m < TOUCHED * reach_m
+        return apart_m < MOVED_SHARE * reach_m
 
     def _connected(self, client: viser.ClientHandle) -> None:
         """Register a new client: its page and view, camera and theme.

@@ -12,9 +12,9 @@ PAGE: Final = "index.html"
 TRANSLUCENT: Final = "translucent.js"
 """First script of every scene of viser, on the page and exported."""
 TOKEN_FORM: Final = "token.html"
-WRONG: Final = "<!-- wrong -->"
+WRONG_MARK: Final = "<!-- wrong -->"
 """Place of the form's message about a wrong token."""
-PLACE: Final = "<!-- a box for each layer -->"
+BOXES: Final = "<!-- a box for each layer -->"
 """Place of the boxes."""
 
 
@@ -25,7 +25,7 @@ def page_file(name: str) -> bytes:
         FileNotFoundError: there is none of this name.
     """
     content = (resources.files("flexdt.clients.viewer") / "data" / name).read_bytes()
-    return content.replace(PLACE.encode(), boxes(LAYERS).encode(), 1) if name == PAGE else content
+    return content.replace(BOXES.encode(), boxes(LAYERS).encode(), 1) if name == PAGE else content
 
 
 def token_form(wrong: bool) -> bytes:
@@ -35,7 +35,7 @@ def token_form(wrong: bool) -> bytes:
         wrong: whether a wrong one was given.
     """
     said = b'<p id="wrong" role="alert">This is not it.</p>' if wrong else b""
-    return page_file(TOKEN_FORM).replace(WRONG.encode(), said, 1)
+    return page_file(TOKEN_FORM).replace(WRONG_MARK.encode(), said, 1)
 
 
 def boxes(layers: tuple[Layer, ...]) -> str:

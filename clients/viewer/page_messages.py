@@ -21,7 +21,7 @@ LARGEST_SIDE: Final = 4096
 """Largest side of a picture of a view [px]."""
 MAX_SMALL: Final = 4096
 """Largest size of any message but a picture [bytes]."""
-SHOWN: Final = 40
+SHOWN_LETTERS: Final = 40
 Length = Annotated[float, Ge(-1e6), Le(1e6)]
 Part = Annotated[float, Ge(-2), Le(2)]
 Triple = Annotated[tuple[Length, Length, Length], Field(strict=False)]
@@ -104,14 +104,14 @@ def admitted(raw: str | bytes) -> bytes:
     except (ValueError, msgpack.UnpackException, AttributeError, LookupError, TypeError):
         raise Unwanted("no message") from None
     if model is None:
-        raise Unwanted(f"{str(kind)[:SHOWN]!a}")
+        raise Unwanted(f"{str(kind)[:SHOWN_LETTERS]!a}")
     if model is not GetRenderResponseMessage and len(raw) > MAX_SMALL:
         raise Unwanted(f"a {kind} that is too long")
     try:
         read = model.model_validate(fields)
     except ValidationError as error:
         where = ".".join(map(str, error.errors()[0]["loc"]))
-        raise Unwanted(f"a {kind} with a wrong {where[:SHOWN]!a}") from None
+        raise Unwanted(f"a {kind} with a wrong {where[:SHOWN_LETTERS]!a}") from None
     if isinstance(read, GetRenderResponseMessage) and not _small_picture(read.payload):
         raise Unwanted(f"a {kind} that is no PNG of at most {LARGEST_SIDE} pixels a side")
     return bytes(msgpack.packb({**read.model_dump(), "type": kind}))

@@ -72,7 +72,7 @@ from flexdt.twin.script.compose import compose_script
 from flexdt.twin.script.scan_request import Kind as KindOfScan
 from flexdt.twin.script.scan_request import ScanRequest
 
-APART: Final = 0.01
+MIN_DIFFERENCE: Final = 0.01
 """Least difference of two positions that are not the same [mm, deg]."""
 MAX_SHARED: Final = 2
 """Largest number of pictures and exports at a time, for all pages: each may take
@@ -529,10 +529,10 @@ def _moved(text: str, lab: LabScene, state: State) -> dict[str, tuple[float, flo
     plan = plans.plan_text(text, lab.machine, lab.profile, state)
     stands, found = motors(lab.machine, state), {}
     for axis, there in plans.projection_positions(plan).items():
-        if not len(there) or np.ptp(there) > APART:
+        if not len(there) or np.ptp(there) > MIN_DIFFERENCE:
             continue
         others = (float(there[0]), lab.machine.axes[axis].home)
-        if min(abs(at - stands[axis]) for at in others) > APART:
+        if min(abs(at - stands[axis]) for at in others) > MIN_DIFFERENCE:
             found[axis] = (stands[axis], round(float(there[0]), 6))
     return found
 

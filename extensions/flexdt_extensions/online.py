@@ -35,7 +35,7 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
 
-FIRST = 3
+FIRST_FRAMES = 3
 """Number of frames before the first identification is tried."""
 GATE_SIGMAS = 6.0
 GATE_PX = 3.0
@@ -163,7 +163,7 @@ def feed(state: Online, pose: Poses, detections: Detections) -> Online:
 def _first(state: Online) -> Online:
     """Attempt to distinguish the beads from all frames so far."""
     assert state.poses is not None
-    if len(state.detections) < FIRST or sum(len(d) for d in state.detections) < 6:
+    if len(state.detections) < FIRST_FRAMES or sum(len(d) for d in state.detections) < 6:
         return state
     found = attempt(state.detections, state.model, state.poses, start=state.start)
     if found is None or found.ambiguous or found.explained < 0.6 or found.rms_px > 1.0:

@@ -20,12 +20,12 @@ from flexdt.extending import CommandError
 
 REFUSED: Final = 4
 """Exit code where no workers can be had."""
-BARREN: Final = 3
+MAX_BARREN: Final = 3
 """Number of jobs in a row that end before a worker of theirs has come, after which no
 more are submitted."""
-ANSWER_S: Final = 60.0
+TIMEOUT_S: Final = 60.0
 """Time limit of one of SLURM's commands [s]."""
-SHOWN: Final = 4
+SHOWN_JOBS: Final = 4
 """Largest number of jobs that a line names."""
 PLACEHOLDER: Final = "dummy-name"
 """Name of the workers in a script that dask-jobqueue writes."""
@@ -128,7 +128,7 @@ class SlurmJobs:
             Lines about ended jobs, and an error of sbatch.
 
         Raises:
-            CommandError: `BARREN` jobs in a row ended before a worker of theirs came.
+            CommandError: `MAX_BARREN` jobs in a row ended before a worker of theirs came.
         """
         lines = []
         for job in gone:
@@ -137,9 +137,9 @@ class SlurmJobs:
             self.jobs.remove(job)
             self._barren = 0 if job.seen else self._barren + 1
             why = _outcome(job.id)
-            if self._barren >= BARREN:
+            if self._barren >= MAX_BARREN:
                 raise CommandError(
-                    f"{BARREN} jobs have ended before a worker of theirs came, the last one, "
+                    f"{MAX_BARREN} jobs have ended before a worker of theirs came, the last one, "
                     f"{job.id}: {why}; slurm-{job.id}.out may say more",
                     REFUSED,
                 )
@@ -151,7 +151,7 @@ class SlurmJobs:
         return lines
 
     def _waiting(self, queue: Mapping[str, str]) -> str:
-        shown = [f"{job.id} {queue.get(job.id, 'UNKNOWN')}" for job in self.jobs[:SHOWN]]
+        shown = [f"{job.id} {queue.get(job.id, 'UNKNOWN')}" for job in self.jobs[:SHOWN_JOBS]]
         more = len(self.jobs) - len(shown)
         if not shown:
             return "waits for workers: no job is in the queue"
@@ -205,11 +205,11 @@ def _run(*words: str) -> subprocess.CompletedProcess[str]:
     """Run one of SLURM's commands; one that is not there or does not answer has failed."""
     try:
         return subprocess.run(
-            words, capture_output=True, text=True, errors="replace", timeout=ANSWER_S, check=False,
+            words, capture_output=True, text=True, errors="replace", timeout=TIMEOUT_S, check=False,
             stdin=subprocess.DEVNULL, start_new_session=True,
         )  # fmt: skip
     except subprocess.TimeoutExpired:
-        return subprocess.CompletedProcess(words, 1, "", f"no answer within {ANSWER_S:g} s")
+        return subprocess.CompletedProcess(words, 1, "", f"no answer within {TIMEOUT_S:g} s")
     except OSError as error:
         return subprocess.CompletedProcess(words, 1, "", f"{words[0]}: {error.strerror}")
 

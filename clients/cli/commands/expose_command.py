@@ -14,7 +14,7 @@ from flexdt.library import machines
 if TYPE_CHECKING:
     from flexdt.library.expose import Forecast, Measured, Transmission
 
-BEST: Final = 5
+SHOWN_SETTINGS: Final = 5
 """Number of proposed settings that are shown."""
 
 
@@ -109,7 +109,7 @@ def _told(forecast: Forecast) -> Answer:
     rows = [
         (f"{s.kV:g}", s.filter or "-", f"{s.averages} x {s.exposure_ms:.4g}",
          "-" if s.cnr is None else f"{s.cnr:.3g}", f"{s.kerma_mGy:.3g}")
-        for s in forecast.best[:BEST]
+        for s in forecast.best[:SHOWN_SETTINGS]
     ]  # fmt: skip
     yield f"best of {len(forecast.best)} settings of the same power and time:"
     yield table(rows, ("kV", "filter", "ms", "contrast/noise", "mGy"))

@@ -22,9 +22,9 @@ from flexdt.twin.machine.description import Component
 
 SIDE_PX: Final = 48
 """Number of rows and columns of a shadow's picture."""
-DARKEST: Final = 0.55
+MAX_OPACITY: Final = 0.55
 """Opacity of a shadow under the part itself."""
-SPREAD: Final = 0.16
+SPREAD_SHARE: Final = 0.16
 """Reach of a shadow beyond each side, over the part's own size."""
 ABOVE_MM: Final = 0.8
 """Height of a shadow above the surface below it [mm]."""
@@ -66,7 +66,7 @@ def shadow(part: Component, top_mm: float) -> bytes:
         part: that casts it.
         top_mm: height of the surface below [mm].
     """
-    width, depth, _ = (1.0 + 2.0 * SPREAD) * np.asarray(part.size_mm)
+    width, depth, _ = (1.0 + 2.0 * SPREAD_SHARE) * np.asarray(part.size_mm)
     x, y, _ = part.center_mm
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [width / 2, depth / 2] + [x, y]
     place = np.column_stack([corners, np.full(4, top_mm + ABOVE_MM)]) * MM
@@ -86,9 +86,9 @@ def shadow(part: Component, top_mm: float) -> bytes:
 def _soft() -> Image.Image:
     """Draw a black square whose edges fade, RGBA."""
     at = np.abs((np.arange(SIDE_PX) + 0.5) / SIDE_PX * 2.0 - 1.0)
-    inner = 1.0 / (1.0 + 2.0 * SPREAD)
+    inner = 1.0 / (1.0 + 2.0 * SPREAD_SHARE)
     share = np.clip((1.0 - at) / (1.0 - inner), 0.0, 1.0)
     smooth = share**2 * (3.0 - 2.0 * share)
     rgba = np.zeros((SIDE_PX, SIDE_PX, 4), dtype=np.uint8)
-    rgba[..., 3] = np.round(255.0 * DARKEST * np.outer(smooth, smooth))
+    rgba[..., 3] = np.round(255.0 * MAX_OPACITY * np.outer(smooth, smooth))
     return Image.fromarray(rgba)

@@ -39,22 +39,22 @@ from flexdt.twin.machine.description import Machine, Profile
 
 LAMP_M: Final = 0.045
 """Radius of the cabinet's lamp in the FleX-ray."""
-CONE: Final = 0.2
+CONE_OPACITY: Final = 0.2
 """Opacity of the full beam in a picture that needs no browser."""
 BEAM_OFF: Final = (120, 140, 165)
 SURFACE: Final = (70, 190, 255)
-FADED: Final = 0.12
+FADED_OPACITY: Final = 0.12
 """Largest opacity of a sample whose volume is drawn within it."""
 FLOOR: Final = (140, 150, 165)
 RANGE: Final = (240, 150, 40)
 RED: Final = (230, 50, 40)
 AMBER: Final = (255, 160, 30)
-STAND: Final = "/object/stand"
+STAND_NODE: Final = "/object/stand"
 GAP_MM: Final = 0.6
 """Distance of the image from the panel's face, in front of which it floats."""
 NEAR: Final = ("sample_mount", "sample_holder")
 """Roles of the parts that turn with the sample."""
-HERE: Final = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+WORLD_POSE: Final = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """The pose of parts in the world's own frame."""
 AXIS_REACH_MM: Final = 120.0
 SCALE_MM, AXES_MM = 500.0, 150.0
@@ -141,7 +141,7 @@ class LabScene:
                     cast_shadow=False, receive_shadow=False,
                 )  # fmt: skip
         pieces, lamp = cabinet(room)
-        self._solids["cabinet"], self._sent["cabinet"] = cut(pieces), HERE
+        self._solids["cabinet"], self._sent["cabinet"] = cut(pieces), WORLD_POSE
         still: Any = {"cast_shadow": False, "receive_shadow": False}
         self._lamp = scene.add_icosphere(
             "/cabinet/lamp",
@@ -153,7 +153,7 @@ class LabScene:
         scene.add_glb("/cabinet/walls", glb(pieces), cast_shadow=False)
         self._frames["sample"] = scene.add_frame("/sample", show_axes=False)
         self._frames["object"] = scene.add_frame("/object", show_axes=False)
-        scene.add_frame(STAND, show_axes=False)
+        scene.add_frame(STAND_NODE, show_axes=False)
         scene.add_frame(HOME, show_axes=False)
         scene.add_frame("/beam", show_axes=False)
         blank = np.zeros((8, 8, 3), dtype=np.uint8)
@@ -303,7 +303,7 @@ class LabScene:
         if "panel" in shown and not near:
             out.append(image_on(np.asarray(self._image.image), world))
         if self._lit and "beam" in shown and not near:
-            out.append(cone(world, LIGHT, CONE))
+            out.append(cone(world, LIGHT, CONE_OPACITY))
         return out
 
     # -- visible parts -----------------------------------------------------------------------
@@ -373,7 +373,7 @@ class LabScene:
         Args:
             look: the sample; without meshes there is no rod.
         """
-        name = f"{STAND}/rod"
+        name = f"{STAND_NODE}/rod"
         mount = next((p for p in self.machine.components if p.role == "sample_mount"), None)
         known = self._server.scene.get_handle_by_name(name)
         if known is not None:
@@ -398,7 +398,7 @@ class LabScene:
         out = {n: {"visible": visible} for n, visible in self._visible(shown, near).items()}
         skins = () if self._look is None else self._look.skins
         within = faded and self._surface is not None
-        opacity = min(shown.opacity, FADED) if within else shown.opacity
+        opacity = min(shown.opacity, FADED_OPACITY) if within else shown.opacity
         clear = {f"/sample/{s.name}": _clear(opacity, s.dense and not within) for s in skins}
         return {**out, **clear}
 

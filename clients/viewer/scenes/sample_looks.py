@@ -35,8 +35,8 @@ COLORS: Mapping[str, tuple[int, int, int]] = {
     "bone": (240, 226, 196),
 }
 """Material -> colour; others get the last one's."""
-OTHER: Final = (214, 170, 90)
-KEPT: Final = 8
+OTHER_COLOR: Final = (214, 170, 90)
+MAX_LOOKS: Final = 8
 MAX_FACES: Final = 200_000
 DEFAULT_MATERIAL: Final = "abs"
 Key = tuple[str | None, str | None, str | None]
@@ -122,7 +122,7 @@ class MeshCache:
 
     def _keep(self, sample: SampleState, phantom: Phantom) -> None:
         self._made[_key(sample)] = _skins(phantom)
-        while len(self._made) > KEPT:
+        while len(self._made) > MAX_LOOKS:
             self._made.popitem(last=False)
 
 
@@ -148,7 +148,7 @@ def _skins(phantom: Phantom) -> SampleLook:
         vertices, faces = plain(mesh)
         name = "".join(c if c.isalnum() else "_" for c in material)
         dense = material == "steel" and len(groups) > 1
-        skins.append(Skin(name, vertices, faces, COLORS.get(material, OTHER), dense))
+        skins.append(Skin(name, vertices, faces, COLORS.get(material, OTHER_COLOR), dense))
     return SampleLook(tuple(skins), np.asarray(phantom.beads))
 
 
@@ -156,7 +156,7 @@ def _box(sample: SampleState) -> SampleLook:
     if sample.size_mm is None:
         return NOTHING
     vertices, faces = plain(trimesh.creation.box(extents=sample.size_mm))
-    skin = Skin("size", vertices, faces, OTHER, False)
+    skin = Skin("size", vertices, faces, OTHER_COLOR, False)
     return SampleLook((skin,), np.zeros((0, 3)), exact=False)
 
 

@@ -25,7 +25,7 @@ from flexdt.twin.geometry.conventions import FloatArray
 NEAR_M = 0.02
 """Least distance from the eye [m]; a nearer triangle is left out completely."""
 LARGE_MM = 250.0
-AT_ONCE = 1 << 21
+PLACES_AT_ONCE = 1 << 21
 """Number of places of the screen that are tested at a time: some 100 MB."""
 SMOOTH, SMALL_PX = 2, 1 << 17
 """Computed pixels of each side of a pixel, in pictures with no more pixels: a view's
@@ -36,7 +36,7 @@ GROUND = {False: ((248, 250, 253), (217, 225, 236)), True: ((42, 49, 64), (15, 1
 """Dark page or not -> colour of the background above and below, as the scenes have it."""
 Pose = tuple[float, ...]
 """Quaternion (w, x, y, z) and place [m]."""
-COARSE = (76, 60)
+IMAGE_CELLS = (76, 60)
 """Number of columns and rows of the image on the panel."""
 
 
@@ -83,8 +83,8 @@ def placed(shapes: Iterable[Shape], pose: Pose) -> list[Shape]:
 
 def image_on(rgb: npt.NDArray[np.uint8], world: World) -> Shape:
     """Make the shape of the panel's image (rows, cols, 3), in front of the panel."""
-    (cols, rows), (first, right, _, down) = COARSE, world.corners - world.normal
-    colors = cv2.resize(rgb, COARSE, interpolation=cv2.INTER_AREA).reshape(-1, 3)
+    (cols, rows), (first, right, _, down) = IMAGE_CELLS, world.corners - world.normal
+    colors = cv2.resize(rgb, IMAGE_CELLS, interpolation=cv2.INTER_AREA).reshape(-1, 3)
     y, x = (part[..., None] for part in np.mgrid[: rows + 1, : cols + 1])
     grid = (first + (right - first) * x / cols + (down - first) * y / rows) * MM
     a, b, c, d = grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]
@@ -208,7 +208,7 @@ def _filled(
     for across, down in np.unique(power[whole], axis=0).tolist():
         of_class = np.flatnonzero(whole & (power == (across, down)).all(axis=1))
         columns, rows = np.arange(2**across)[None, None], np.arange(2**down)[None, :, None]
-        pieces = 1 + (len(of_class) << (across + down)) // AT_ONCE
+        pieces = 1 + (len(of_class) << (across + down)) // PLACES_AT_ONCE
         for some in np.array_split(of_class, pieces):
             first, last = low[some].astype(int), high[some].astype(int)
             inside = (columns < (last - first)[:, :1, None]) & (rows < (last - first)[:, 1:, None])

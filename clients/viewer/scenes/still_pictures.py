@@ -12,7 +12,7 @@ from flexdt.clients.viewer.scenes.views import Fitted
 
 LEAST_PX, MOST_PX = 32, 1200
 MOST_BYTES: Final = 60_000
-KEPT: Final = 16
+MAX_PICTURES: Final = 16
 
 
 class Stills:
@@ -46,7 +46,7 @@ class Stills:
                 self._kept[key] = await asyncio.to_thread(
                     lambda: jpeg(drawn(shapes(), seen, (width, height), dark), MOST_BYTES)
                 )
-                while len(self._kept) > KEPT:
+                while len(self._kept) > MAX_PICTURES:
                     self._kept.popitem(last=False)
             return self._kept[key]
 

@@ -26,12 +26,12 @@ from flexdt.clients.viewer.scenes.world import MM, World
 from flexdt.twin.geometry.conventions import FloatArray
 
 Vector = tuple[float, float, float]
-WIDEST = 3.0
+MAX_SIZE_RATIO = 3.0
 """Largest width or height of the beam's eye, over the panel's; beyond, the camera
 looks at the panel's centre instead and the frame is no longer exact."""
 WIDE = 1.35
 """Aspect (width over height) of a pane whose size is not known yet."""
-NARROWEST, BROADEST = 0.3, 4.0
+MIN_ASPECT, MAX_ASPECT = 0.3, 4.0
 """Range of aspects for which cameras are made."""
 ROOM = 0.9
 """Part of the picture, in width and height, that fitted points take."""
@@ -131,7 +131,7 @@ LEAST_REACH: Final = 0.75
 
 def bounded(aspect: float) -> float:
     """Cut an aspect to the range for which cameras are made."""
-    return min(BROADEST, max(NARROWEST, aspect))
+    return min(MAX_ASPECT, max(MIN_ASPECT, aspect))
 
 
 def presets(world: World, radius_mm: float, rim_mm: FloatArray | None = None) -> dict[str, Fitted]:
@@ -240,7 +240,7 @@ def beam_view(world: World) -> tuple[Standpoint, dict[str, object]]:
     width, height = cols * pu, rows * pv
     left, top = (column + 0.5) * pu, (row + 0.5) * pv
     half_w, half_h = max(left, width - left), max(top, height - top)
-    exact = 2.0 * half_w <= WIDEST * width and 2.0 * half_h <= WIDEST * height
+    exact = 2.0 * half_w <= MAX_SIZE_RATIO * width and 2.0 * half_h <= MAX_SIZE_RATIO * height
     if exact:
         target, far = world.foot, world.distance
     else:

@@ -23,7 +23,7 @@ GROWING_CELLS: Final = 64
 """Number of cells along the longest side of the grid while a scan runs."""
 FINISHED_CELLS: Final = 110
 """Number of cells along the longest side of the grid once it has ended."""
-MOST_FACES: Final = 90_000
+MAX_FACES: Final = 90_000
 """Largest number of triangles of a surface; a grid with more is made coarser."""
 OTSU_BINS: Final = 256
 Faces = npt.NDArray[np.int32]
@@ -127,7 +127,7 @@ def surface(
         coarse = np.nan_to_num(_means(grown, shape, factor))
         padded = np.pad(coarse, 1, constant_values=float(coarse.min()))
         vertices, faces = net(padded, otsu(coarse))
-        if len(faces) <= MOST_FACES:
+        if len(faces) <= MAX_FACES:
             break
         factor *= 2
     steps = ((vertices - 0.5) * factor - np.array(grown.shape) / 2)[:, [1, 0, 2]]

@@ -56,30 +56,30 @@ from flexdt.twin.reconstruction.feldkamp.backprojection import OnProcessor
 from flexdt.twin.reconstruction.feldkamp.fdk import fdk_parts
 from flexdt.twin.scanner.state import NamedCorrection
 
-MOST_VOXELS: Final = 14 << 20
+MAX_VOXELS: Final = 14 << 20
 """Largest number of voxels of a finished volume for a page: 28 MB, and 239 x 239 x 190
 voxels of the usual camera mode at full resolution."""
-MOST_GROWING: Final = 3 << 20
+MAX_GROWING_VOXELS: Final = 3 << 20
 """Largest number of voxels of a volume that is sent every second: 6 MB."""
 TOP: Final = 65534
 """Codes are 1 + 0..TOP between the least and the greatest value; 0 is a voxel without data."""
-DARKEST: Final = 0.3
+LOW_SHARE: Final = 0.3
 """Lower end of the window, as a part of the bright values: streaks below air stay
 dark."""
-SAMPLES: Final = 200_000
+WINDOW_SAMPLES: Final = 200_000
 """Number of voxels from which the window is chosen."""
-MOST_VIEWS: Final = 360
+MAX_VIEWS: Final = 360
 """Largest number of views; of a longer scan every n-th image is taken."""
 LOOK_S: Final = 0.1
 TELL_S: Final = 0.4
 """Least interval between two lines [s]."""
-SURFACE_S: Final = 1.2
+SURFACE_INTERVAL_S: Final = 1.2
 """Least interval between two surfaces for the scenes [s]."""
 
 Tell = Callable[[dict[str, Any]], None]
 
 
-def block(data: Float32Array, most: int = MOST_VOXELS) -> tuple[dict[str, Any], bytes]:
+def block(data: Float32Array, most: int = MAX_VOXELS) -> tuple[dict[str, Any], bytes]:
     """Encode a volume for a page.
 
     Args:
@@ -105,12 +105,12 @@ def block(data: Float32Array, most: int = MOST_VOXELS) -> tuple[dict[str, Any], 
     with np.errstate(invalid="ignore"):  # not a number becomes 0 below
         codes = ((cubes - low) * (TOP / (high - low)) + 1.5).astype("<u2")
     codes[~there] = 0
-    some = cubes.reshape(-1)[:: max(1, cubes.size // SAMPLES)]
+    some = cubes.reshape(-1)[:: max(1, cubes.size // WINDOW_SAMPLES)]
     some = some[np.isfinite(some)]
     dark, bright = (
         (float(v) for v in np.percentile(some, (1.0, 99.8))) if some.size else (low, high)
     )
-    window = [max(dark, -DARKEST * abs(bright)), max(bright, dark + 1e-9)]
+    window = [max(dark, -LOW_SHARE * abs(bright)), max(bright, dark + 1e-9)]
     head = {"shape": [nz, ny, nx], "factor": factor, "low": low, "high": high, "window": window}
     return head, codes.tobytes()
 
@@ -170,7 +170,7 @@ def grow(held: Held, folder: Path, side: int, alive: Callable[[], bool] = lambda
     """
     _wait(folder / "flexdt.json", alive)
     data = load_dataset(folder)
-    indices = range(0, len(data), max(1, -(-len(data) // MOST_VIEWS)))
+    indices = range(0, len(data), max(1, -(-len(data) // MAX_VIEWS)))
     factor = max(1, data.shape[1] // side)
     cone_vec = data.corrected()[np.array(indices)].binned(factor, data.shape)
     shape = data.shape[0] // factor, data.shape[1] // factor
@@ -197,7 +197,7 @@ def grow(held: Held, folder: Path, side: int, alive: Callable[[], bool] = lambda
         told = time.monotonic()
         views = round(done * len(indices))
         more = {}
-        if done == 1.0 or told >= drawn + SURFACE_S:
+        if done == 1.0 or told >= drawn + SURFACE_INTERVAL_S:
             drawn = told
             more["surface"] = surface(target.volume(), like.voxel_mm, like.center_mm)
         held.say(views=views, of=len(indices), **more)
@@ -338,7 +338,7 @@ def answer(held: Held, served: Served, asked: list[str]) -> None:
     """
     match asked:
         case ["block", name] if name in held.volumes:
-            most = MOST_VOXELS if held.about["past"] else MOST_GROWING
+            most = MAX_VOXELS if held.about["past"] else MAX_GROWING_VOXELS
             served.answer(*block(held.volumes[name], most))
         case ["voxel", x, y, z]:
             at = int(x), int(y), int(z)

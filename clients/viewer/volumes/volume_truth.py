@@ -29,9 +29,9 @@ Mask = npt.NDArray[np.bool_]
 LEVELS: Final = 240
 """Number of bins of the attenuation's logarithm in which the sample's main material is
 sought."""
-NOTHING: Final = 1e-6
+VACUUM_PER_MM: Final = 1e-6
 """Less attenuation than any matter's [1/mm]."""
-ALIKE: Final = 0.1
+ALIKE_SHARE: Final = 0.1
 """Largest relative difference from the attenuation of the main material."""
 
 
@@ -112,7 +112,7 @@ def figures(values: Float32Array, truth: Float32Array, voxel_mm: float) -> dict[
     """
     mu = main_level(truth)
     known = np.isfinite(values)
-    alike = (np.abs(truth - mu) < ALIKE * mu) & known
+    alike = (np.abs(truth - mu) < ALIKE_SHARE * mu) & known
     inside = ndimage.binary_erosion(alike)
     if not inside.any():  # walls of a few voxels
         inside = alike
@@ -150,7 +150,7 @@ def told(value: float) -> float | None:
 def main_level(truth: Float32Array) -> float:
     """Find the attenuation of most of the sample [1/mm]; partly filled voxels all
     differ."""
-    there = np.log(truth[truth > NOTHING].astype(np.float64))
+    there = np.log(truth[truth > VACUUM_PER_MM].astype(np.float64))
     if not there.size:
         return math.nan
     counts, edges = np.histogram(there, LEVELS)

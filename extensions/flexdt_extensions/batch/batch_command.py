@@ -25,7 +25,7 @@ from flexdt.extending import (
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
-EVERY_S = 2.0
+PROGRESS_S = 2.0
 """Interval between lines of progress [s]."""
 
 
@@ -78,7 +78,7 @@ def batch(
 
     def tell(done: int, items: int, rate: float) -> None:
         nonlocal last
-        if time.monotonic() - last >= EVERY_S or done == items:
+        if time.monotonic() - last >= PROGRESS_S or done == items:
             last = time.monotonic()
             left = (items - done) / rate if rate > 0 else 0.0
             note(f"{done}/{items} items, {rate:.2f} a second, {left:.0f} s left")

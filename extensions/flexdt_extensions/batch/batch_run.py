@@ -283,9 +283,9 @@ def write(path: Path, document: object) -> None:
     write_whole(path, json.dumps(document, indent=1, sort_keys=True) + "\n")
 
 
-IN_FLIGHT = 512
+MAX_IN_FLIGHT = 512
 """Largest number of items submitted at a time: enough for a cluster."""
-IN_MEMORY = 2 * 2**30
+MAX_WAITING_BYTES = 2 * 2**30
 """Largest size of the outcomes that wait for the store [bytes]."""
 
 Tell = Callable[[int, int, float], None]
@@ -350,7 +350,7 @@ def _work(store: Store, pool: Executor, started: float, tell: Tell | None) -> No
         CommandError: a worker died.
     """
     text, todo = store.plan.text, store.missing()
-    in_flight = max(4, min(IN_FLIGHT, IN_MEMORY // item_bytes(store.plan)))
+    in_flight = max(4, min(MAX_IN_FLIGHT, MAX_WAITING_BYTES // item_bytes(store.plan)))
     begun = len(store.records)
     flying: set[Future[ItemOutcome]] = set()
     try:

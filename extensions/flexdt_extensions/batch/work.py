@@ -54,7 +54,7 @@ from flexdt_extensions.batch.batch_plan import Cuboid, Plan, Spheres, parse_plan
 
 VALUES, NOISE, SHAPES = 0, 1, 2
 """Streams of an item's seed: scalar draws in the plan's order, noise, the phantom's parts."""
-TRIES: Final = 2000
+MAX_TRIES: Final = 2000
 """Largest number of places tried for a sphere before a phantom counts as impossible."""
 
 
@@ -219,7 +219,7 @@ def _spheres(
         The phantom, and its description for the manifest.
 
     Raises:
-        TwinError: a sphere found no free place in `TRIES` tries.
+        TwinError: a sphere found no free place in `MAX_TRIES` tries.
     """
     wide, high = table.within_radius_mm, table.within_height_mm / 2.0
     solids: list[Solid] = []
@@ -231,7 +231,7 @@ def _spheres(
         if center is None:
             raise TwinError(
                 f"sphere {number + 1} of {radius:.3g} mm found no free place in a cylinder of "
-                f"{wide:g} mm radius and {2 * high:g} mm height in {TRIES} tries",
+                f"{wide:g} mm radius and {2 * high:g} mm height in {MAX_TRIES} tries",
                 {"asked": radius, "allowed": [wide, high]},
             )
         solids.append(Solid(Sphere(center, radius), made_of.name, made_of.mu_per_mm))
@@ -246,7 +246,7 @@ def _place(
 ) -> tuple[float, float, float] | None:
     if radius > wide or radius > high:
         return None
-    for _ in range(TRIES):
+    for _ in range(MAX_TRIES):
         distance = (wide - radius) * math.sqrt(rng.uniform())
         turn = rng.uniform(0.0, 2.0 * math.pi)
         at = (distance * math.cos(turn), distance * math.sin(turn),

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from flexdt.extending import Answer, CommandError, names, option
 
-WRONG = 2
+INVALID_OPTIONS = 2
 """Exit code of invalid options."""
 
 
@@ -33,12 +33,12 @@ def bench(
     wanted = [] if only is None else names(only)
     if unknown := [name for name in wanted if name not in case_names()]:
         known = ", ".join(case_names())
-        raise CommandError(f"no case {', '.join(unknown)}; there are: {known}", WRONG)
+        raise CommandError(f"no case {', '.join(unknown)}; there are: {known}", INVALID_OPTIONS)
     text, name = "", "bench"
     if device:
         found = gpu.availability()
         if not found.present:
-            raise CommandError(f"--device needs a CUDA device: {found.reason}", WRONG)
+            raise CommandError(f"--device needs a CUDA device: {found.reason}", INVALID_OPTIONS)
         document = run_device_bench(to_stderr)
         text, name = page(document), "device"
     else:

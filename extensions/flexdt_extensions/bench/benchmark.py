@@ -38,9 +38,9 @@ PITCH = {BINNED: 0.1496, FULL: 0.0748}
 TILT_DEG = (0.4, 0.7, 0.3)
 """Rotation in the detector's plane, and two out of it [deg]."""
 NONE = (0.0, 0.0, 0.0)
-LYING = (90.0, 0.0, 0.0)
-FAR = 100.0
-START = 0.3
+LYING_TILT_DEG = (90.0, 0.0, 0.0)
+FAR_RATIO = 100.0
+START_RAD = 0.3
 """First angle [rad]: no axis of the volume is special."""
 
 
@@ -96,7 +96,7 @@ def circle(
     raise_ = rotation_about(np.array([1.0, 0, 0]), -math.radians(above_deg))
     rows = []
     for i in range(views):
-        r = rotation_z(START + 2 * math.pi * i / views) @ raise_
+        r = rotation_z(START_RAD + 2 * math.pi * i / views) @ raise_
         source = np.array([0, -sod, height])
         centre = np.array([0, sdd - sod, -height * (sdd / sod - 1)])
         rows.append(np.concatenate([r @ source, r @ centre, pixel * (r @ u), pixel * (r @ v)]))
@@ -160,15 +160,15 @@ def untuned_cases() -> list[Case]:
     # 60 degrees across the detector's diagonal.
     wide = 2 * math.tan(math.radians(30)) * 80.0 / math.hypot(*s)
     cone: dict[str, Any] = {"sod": 40.0, "sdd": 80.0, "pitch": wide}
-    aslant = (LYING[0] + TILT_DEG[0], *TILT_DEG[1:])
+    aslant = (LYING_TILT_DEG[0] + TILT_DEG[0], *TILT_DEG[1:])
     near, small = {"sod": 19.2, "sdd": 60.0, "pitch": 0.08}, (95, 120)
     # Nearly parallel rays pass no z level: only the walk through the voxel columns remains.
-    far = {"sod": FAR * SOD, "sdd": FAR * SDD}
+    far = {"sod": FAR_RATIO * SOD, "sdd": FAR_RATIO * SDD}
     rows: list[tuple[str, tuple[int, int, int], dict[str, Any], str]] = [
         ("cone-60", cube, cone, "60 degree cone"),
         ("cone-60-tilt", cube, cone | {"tilt_deg": TILT_DEG}, "and tilt"),
         ("tilt-45", C1_SHAPE, {"tilt_deg": strong}, "three tilts of 45 degrees"),
-        ("roll-90", C1_SHAPE, {"tilt_deg": LYING}, "C1, detector on its side"),
+        ("roll-90", C1_SHAPE, {"tilt_deg": LYING_TILT_DEG}, "C1, detector on its side"),
         ("roll-90-tilt", C1_SHAPE, {"tilt_deg": aslant}, "and tilted"),
         ("near", cube, near, "source 1 mm off the box"),
         ("flat", (4, 1024, 1024), {"height": 100.0}, "4 slices of 1024^2, from above"),
@@ -195,15 +195,15 @@ def all_cases() -> list[Case]:
 def on_axis(shape: tuple[int, int]) -> ConeVec:
     """Make one tilted view whose central ray runs along y."""
     view = circle(1, shape, tilt_deg=TILT_DEG)
-    back = rotation_z(-START)
+    back = rotation_z(-START_RAD)
     return view.moved(back, (0.0, 0.0, 0.0))
 
 
 BUDGET_S = 6.0
 """Time limit of a contestant: no more rounds after it [s]."""
-AT_LEAST, AT_MOST = 3, 15
+MIN_ROUNDS, MAX_ROUNDS = 3, 15
 """Least and largest number of rounds."""
-SHORT_S, MANY = 1.5, 150
+SHORT_S, MAX_SHORT_ROUNDS = 1.5, 150
 """Limit of total time [s] below which a contestant runs up to so many rounds: other
 load hides the best of a few short calls."""
 
@@ -255,9 +255,9 @@ def interleaved(
 
 def _enough(rounds: int, spent_s: float, budget_s: float) -> bool:
     """Check whether a contestant has run often enough."""
-    if rounds < AT_LEAST:
+    if rounds < MIN_ROUNDS:
         return False
-    most = MANY if spent_s < SHORT_S else AT_MOST
+    most = MAX_SHORT_ROUNDS if spent_s < SHORT_S else MAX_ROUNDS
     return spent_s > budget_s or rounds >= most
 
 

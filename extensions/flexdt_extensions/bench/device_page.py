@@ -45,16 +45,16 @@ COUNTS = (1, 36, 360)
 PANEL = BINNED
 FDK_VIEWS = 1434
 ROUNDS = 5
-BESIDE_S = 2.0
+MIN_BACK_S = 2.0
 """Least time of `back` and of the processor's, each [s]."""
-INSTRUCTIONS = 16
+INSTRUCTIONS_A_VOXEL = 16
 """Least number of instructions for a voxel that a ray passes."""
 AGAINST_ASTRA = {"C1": (2, 0.20, 0.15), "512^3": (2, 0.45, 0.30), "1024^3": (1, 0.40, 0.28)}
 """Index into COUNTS, and the shares of ASTRA's time that are accepted and wanted."""
 OF_THE_BOUND = {"C1": (0.25, 0.45), "512^3": (0.30, 0.50), "1024^3": (0.80, 1.00)}
-CUT_OFF = 1.3
+MAX_CUT_OFF = 1.3
 """Largest ratio of FDK's time for any images to that for a complete object."""
-WITH_ERRORS = 1.5
+MAX_ERRORS_RATIO = 1.5
 """Largest ratio of FDK's time with `errors` to that without."""
 ASTRA = "astra-toolbox"
 UNKNOWN_SPEED = "the device does not say how fast it is"
@@ -184,7 +184,7 @@ def case(name: str, tell: Callable[[str], None]) -> dict[int, Document]:
         if views < COUNTS[-1]:  # as the call chooses by itself, and on the processor, in turns
             work = partial(back, out, scan, volume)
             both = {"back_call_ms": work, "back_processor_ms": gpu.switched_off()(work)}
-            times = interleaved(both, budget_s=BESIDE_S)
+            times = interleaved(both, budget_s=MIN_BACK_S)
             entry |= {key: spent.best * 1e3 for key, spent in times.items()}
         if views == COUNTS[0]:
             with gpu.switched_off():
@@ -235,9 +235,9 @@ def further(line: Callable[..., None], cases: dict[str, dict[int, Document]]) ->
         )
         first = first or plain
         what = f"FDK of {FDK_VIEWS} views, {kind}"
-        line(f"{what}, host to host [s]", plain, 2.0 * CUT_OFF, CUT_OFF)
-        line(f"{what}, over an object seen whole", plain / first, CUT_OFF, CUT_OFF)
-        line(f"{what}, with errors / without", told / plain, WITH_ERRORS, WITH_ERRORS)
+        line(f"{what}, host to host [s]", plain, 2.0 * MAX_CUT_OFF, MAX_CUT_OFF)
+        line(f"{what}, over an object seen whole", plain / first, MAX_CUT_OFF, MAX_CUT_OFF)
+        line(f"{what}, with errors / without", told / plain, MAX_ERRORS_RATIO, MAX_ERRORS_RATIO)
     scan, seen = circle(COUNTS[1], PANEL), cases[name][COUNTS[1]]
     for kind, images_of in KINDS.items():
         some = images_of(scan, PANEL)
@@ -303,7 +303,7 @@ def bound(volume: Volume, scan: ConeVec) -> float | None:
     inside = np.maximum(cuts[1].min(axis=1) - cuts[0].max(axis=1), 0.0)
     passed = float((inside * np.abs(d).sum(axis=1)).mean()) * PANEL[0] * PANEL[1] * len(scan)
     each_ms = device.MULTIPROCESSOR_COUNT * 4 * 32 * device.CLOCK_RATE  # kHz
-    return float(max(read_ms, INSTRUCTIONS * passed / each_ms))
+    return float(max(read_ms, INSTRUCTIONS_A_VOXEL * passed / each_ms))
 
 
 def row(line: Document) -> str:

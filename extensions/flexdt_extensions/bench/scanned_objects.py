@@ -18,13 +18,13 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 ATTENUATION: Final = 0.02
 """Attenuation of all objects [1/mm]."""
-WHOLE: Final = 0.6
+COMPLETE_RADIUS: Final = 0.6
 """Radius of a completely seen object, over that of the field of view."""
-WIDE: Final = 1.5
+CUT_OFF_RADIUS: Final = 1.5
 """Radius of an object that the panel cuts off, over that of the field of view."""
-ROD: Final = 0.1
+ROD_RADIUS: Final = 0.1
 """Radius of the holder, whose axis is at the edge of the field of view, over its radius."""
-DRAWN: Final = 32
+NOISE_COUNT: Final = 32
 """Number of noise images that are drawn; more views repeat them."""
 
 
@@ -71,25 +71,25 @@ def _longer(scan: ConeVec, shape: tuple[int, int]) -> FloatArray:
 
 def whole(scan: ConeVec, shape: tuple[int, int]) -> Float32Array:
     """Compute the images of an object that is complete in all views."""
-    return cylinders(scan, shape, [(0.0, WHOLE * field_mm(scan, shape))])
+    return cylinders(scan, shape, [(0.0, COMPLETE_RADIUS * field_mm(scan, shape))])
 
 
 def cut_off(scan: ConeVec, shape: tuple[int, int]) -> Float32Array:
     """Compute the images of an object that extends beyond both sides of the panel in
     all views."""
-    return cylinders(scan, shape, [(0.0, WIDE * field_mm(scan, shape))])
+    return cylinders(scan, shape, [(0.0, CUT_OFF_RADIUS * field_mm(scan, shape))])
 
 
 def holder(scan: ConeVec, shape: tuple[int, int]) -> Float32Array:
     """Compute the images of a complete object and a rod that the panel's edge cuts in
     some views."""
     field = field_mm(scan, shape)
-    return cylinders(scan, shape, [(0.0, WHOLE * field), (field, ROD * field)])
+    return cylinders(scan, shape, [(0.0, COMPLETE_RADIUS * field), (field, ROD_RADIUS * field)])
 
 
 def noise(scan: ConeVec, shape: tuple[int, int]) -> Float32Array:
     """Draw images of random numbers from 0 to 1."""
-    drawn = np.random.default_rng(0).random((min(DRAWN, len(scan)), *shape), dtype=np.float32)
+    drawn = np.random.default_rng(0).random((min(NOISE_COUNT, len(scan)), *shape), dtype=np.float32)
     return drawn[np.arange(len(scan)) % len(drawn)]
 
 

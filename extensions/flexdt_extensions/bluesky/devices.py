@@ -46,7 +46,7 @@ from flexdt_extensions.bluesky.lab_connection import (
     settable,
 )
 
-ARRIVED = 1e-6
+ARRIVAL_TOLERANCE = 1e-6
 """Distance from the target at which an axis has arrived [mm, deg]."""
 
 
@@ -83,7 +83,7 @@ class AxisLogic(MovableLogic[float]):
                 f"[{low:g}, {high:g}] {axis.unit}",
                 {"axis": self.axis, "asked": new_position, "allowed": [low, high]},
             )
-        if not self.collisions or abs(new_position - axis.position) <= ARRIVED:
+        if not self.collisions or abs(new_position - axis.position) <= ARRIVAL_TOLERANCE:
             return
         poses = [{self.axis: new_position}]
         report = await self.link.client.check_trajectory(poses, flat=False)
@@ -114,7 +114,7 @@ class AxisLogic(MovableLogic[float]):
                     return
 
     def _arrived(self, axis: AxisState, target: float, state: State) -> None:
-        if abs(axis.position - target) > ARRIVED:
+        if abs(axis.position - target) > ARRIVAL_TOLERANCE:
             why = " by the emergency stop" if state.safety.estop else ""
             raise RuntimeError(
                 f"{self.axis} stopped{why} at {axis.position:g} {axis.unit}, "

@@ -42,7 +42,7 @@ _WORDS: Final = frozenset(
      "name", "scan_mode", "scan_speed", "temperature", "type", "uncertainty", "unit", "version")
 )  # fmt: skip
 """Keys that change no image here, or only in combination with one that is read."""
-_STILL: Final = 1e-9
+_MIN_CHANGE: Final = 1e-9
 """Changes of place [mm] and direction that count as zero."""
 DUPLEX_WIRE: Final = 0.69
 """Standard deviation of a Gaussian over its basic spatial resolution: two bars at a
@@ -301,7 +301,7 @@ class _ScanReader(ScenarioReader):
             return None
         return MeshSample(
             where, name, unit * np.array(scale), substance, views,
-            there[0] if moves < _STILL else None,
+            there[0] if moves < _MIN_CHANGE else None,
         )  # fmt: skip
 
     # Materials

@@ -37,7 +37,7 @@ from flexdt_extensions.learning.rewards import (
 from flexdt_extensions.learning.scanning import SECTORS, Action, Observation, ScanEnv
 
 VoxelArray = npt.NDArray[np.uint32]
-SMALLEST = 1e-6
+MIN_SUM_SHARE = 1e-6
 """Sums of lengths below this part of the largest are not divided by, as in `flexdt.sirt`."""
 
 
@@ -158,7 +158,7 @@ class Rays:
         volumes = np.stack([task.volume.data.ravel() for task in tasks])
         squares = sirt_kernels.solve(
             self.first, self.voxel, self.length, self.rows, self.columns, taken, counts, images,
-            volumes, ITERATIONS, np.float32(SMALLEST),
+            volumes, ITERATIONS, np.float32(MIN_SUM_SHARE),
         )  # fmt: skip
         sizes = np.einsum("kir,kir->k", images, images, dtype=np.float64)
         for k, task in enumerate(tasks):

@@ -158,7 +158,7 @@ def _named(index: npt.NDArray[np.int64], owner: npt.NDArray[np.intp]) -> npt.NDA
 DESIGN_FRAMES: Final = 48
 """Largest number of frames in the search, spread over the plan; the forecast uses all
 frames."""
-_TRIED: Final = 12
+_TRIED_SEATS: Final = 12
 """Number of seats tried for one bead, best first, before it keeps its own."""
 _TURNS: Final = np.radians(np.arange(10.0, 351.0, 5.0))
 
@@ -400,7 +400,7 @@ def _exchanged(
             others = np.delete(chosen, k)
             scores = _scores_beside(table, others, criterion)
             scores[~_allowed(table, rules, others)] = np.inf
-            for seat in np.argsort(scores, kind="stable")[:_TRIED]:
+            for seat in np.argsort(scores, kind="stable")[:_TRIED_SEATS]:
                 if not scores[seat] < best * (1.0 - 1e-9):
                     break
                 trial = chosen.copy()

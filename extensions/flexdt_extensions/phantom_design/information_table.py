@@ -43,7 +43,7 @@ CRITERIA: Final[Mapping[Criterion, str]] = {
     "d": "D-optimality: geometric mean of the axes of their ellipsoid [px at the panel's edge]",
     "worst": "the largest displacement at the panel's edge [px] by one of them",
 }
-AT_ONCE: Final = 8
+SEATS_AT_ONCE: Final = 8
 """Number of seats whose share is computed together."""
 RIDGE: Final = 1e-9
 """Information added so that sets that determine too little can still be compared."""
@@ -129,8 +129,8 @@ class SeatTable:
             weight: of each frame.
         """
         problems = [
-            _problem(BeadModel(places[first : first + AT_ONCE], np.array(radius)), planned)
-            for first in range(0, len(places), AT_ONCE)
+            _problem(BeadModel(places[first : first + SEATS_AT_ONCE], np.array(radius)), planned)
+            for first in range(0, len(places), SEATS_AT_ONCE)
         ]
         rows = np.concatenate([_rows(problem) for problem in problems])  # (m, n, 2, q)
         layout = problems[0].layout

@@ -396,7 +396,7 @@ def _of(measured: dict[str, float] | None, name: str) -> str:
     return "-" if measured is None else f"{measured[name]:.3g}"
 
 
-SCALE = 12.0
+SCALE_PX_MM = 12.0
 """Scale of the drawings [pixels/mm]."""
 MARGIN_MM = 5.5
 BRICK, HOLE, TUBE, LINE = "#f2d16b", "#fffaf0", "#e3b93f", "#7a6420"
@@ -499,7 +499,7 @@ def _sheet(wide: float, deep: float, top: str, bottom: str) -> Axes:
     """Draw the outline of a brick or block, its edges named, on axes that fill a
     figure."""
     w, h = wide + 2 * MARGIN_MM, deep + 2 * MARGIN_MM
-    figure = blank(w * SCALE, h * SCALE)
+    figure = blank(w * SCALE_PX_MM, h * SCALE_PX_MM)
     figure.set_layout_engine("none")
     axes = figure.add_axes((0, 0, 1, 1), xlim=(-w / 2, w / 2), ylim=(h / 2, -h / 2))
     axes.set_axis_off()
@@ -532,4 +532,4 @@ def _bead(axes: Axes, x: float, y: float, radius: float, number: int) -> None:
 
 
 def _label(axes: Axes, x: float, y: float, text: str, size_mm: float = 1.5) -> None:
-    axes.text(x, y, text, ha="center", va="center", size=size_mm * SCALE, zorder=4)
+    axes.text(x, y, text, ha="center", va="center", size=size_mm * SCALE_PX_MM, zorder=4)

@@ -56,10 +56,10 @@ from flexdt_extensions.studies.rendered_runs import line_integrals, photons
 from flexdt_extensions.studies.runs import Run, attempted, clean, fitted_run
 
 STEPS: Final = np.array([STEP, STEP, STEP, SMALL_STEP, SMALL_STEP, SMALL_STEP])
-PHYSICAL: Final = np.array([1.0, 1.0, 1.0, 1.0, 1.0, -1.0])
+OFFSET_SIGNS: Final = np.array([1.0, 1.0, 1.0, 1.0, 1.0, -1.0])
 """Signs of the author's offsets: they turn against the phantom, so a mount has its z
 reversed."""
-FITTED: Final = 360
+FITTED_PROJECTIONS: Final = 360
 """Number of projections whose logs give the truth; the others are predicted."""
 ENOUGH: Final = 36
 """Least number of projections at which simulation and logs are compared."""
@@ -198,18 +198,18 @@ def physical_truth(group: slice, model: BeadModel) -> GroupTruth:
         model: the beads.
     """
     names = scan_names()[group]
-    logs = [logged(name, FITTED) for name in names]
+    logs = [logged(name, FITTED_PROJECTIONS) for name in names]
     starts = [author()["real"]["scans"][name]["start_deg"] for name in names]
-    values = np.median([values for values, *_ in logs], axis=0) * PHYSICAL
+    values = np.median([values for values, *_ in logs], axis=0) * OFFSET_SIGNS
     values[3] += float(np.median(starts))
     fits: list[Iterated] = []
     for _ in range(4):
-        fits = [authors_fit(n, spots(n, values, FITTED, model), model) for n in names]
+        fits = [authors_fit(n, spots(n, values, FITTED_PROJECTIONS, model), model) for n in names]
         off = [log[0] - fit.x for log, fit in zip(logs, fits, strict=True)]
-        values = values + np.median(off, axis=0) * PHYSICAL
+        values = values + np.median(off, axis=0) * OFFSET_SIGNS
     excess: dict[float, list[float]] = {}
     for name, log, fit in zip(names, logs, fits, strict=True):
-        rest = (log[1] ** 2 - 2.0 * fit.cost / (20 * FITTED)) / NOISE_SHARE
+        rest = (log[1] ** 2 - 2.0 * fit.cost / (20 * FITTED_PROJECTIONS)) / NOISE_SHARE
         excess.setdefault(_sod(name), []).append(rest)
     noise = {sod: math.sqrt(max(float(np.median(rest)), 0.0)) for sod, rest in excess.items()}
     return GroupTruth(values, noise)

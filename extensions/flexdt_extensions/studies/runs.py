@@ -32,7 +32,7 @@ from flexdt_extensions.studies.experiments import (
 
 OURS = "ours"
 ALGORITHM_2 = "Algorithm 2"
-COMPARED = ("mae", "cost_reduction_pct", "iterations")
+COMPARED_FIGURES = ("mae", "cost_reduction_pct", "iterations")
 """Figures of a setting that are compared with the other method's and the thesis's."""
 
 
@@ -262,7 +262,7 @@ def rows_of(experiment: str, runs: Sequence[Run]) -> list[dict[str, object]]:
                 },
                 "method": some[0].method,
                 "beside": _beside(some[0].method, beside),
-                **{f"thesis_{k}": printed.get(k) for k in COMPARED},
+                **{f"thesis_{k}": printed.get(k) for k in COMPARED_FIGURES},
             }
         )
     return out
@@ -276,7 +276,7 @@ def _beside(method: str, figures: Sequence[dict[str, float]]) -> dict[str, objec
         "method": ALGORITHM_2 if method == OURS else OURS,
         "runs": len(figures),
         "success": int(sum(f["success"] for f in figures)),
-        **{k: _mean([f[k] for f in figures]) for k in COMPARED},
+        **{k: _mean([f[k] for f in figures]) for k in COMPARED_FIGURES},
     }
 
 

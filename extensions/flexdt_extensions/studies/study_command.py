@@ -15,7 +15,7 @@ COLUMNS: Final = {
 }  # fmt: skip
 """Member of a row of the document -> head of its column."""
 
-EXACT: Final = (
+EXACT_NOTE: Final = (
     "G = 1 succeeds here and fails in the thesis because exact points have no noise, which the "
     "weak direction multiplies: see --fidelity noisy"
 )
@@ -57,7 +57,7 @@ def study(
         head += ["weak", "largest sigma"]
     yield table(rows, head)
     if (document["experiment"], document["fidelity"]) == ("detector", "points"):
-        yield EXACT
+        yield EXACT_NOTE
     yield from real_lines(document)
     if out is not None:
         yield f"report: {out}"
