@@ -198,7 +198,9 @@ def _refused(machine: d.Machine, profile: d.Profile) -> Iterator[tells.Finding]:
 
 
 def _nothing(question: Question) -> None:
-    """Ask nothing: scripts are read a second time, with the machine that they are of."""
+    """Ignore questions: scripts are read a second time, with the machine to which they
+    belong.
+    """
 
 
 def _texts(folder: Path, ask: Callable[[Question], None]) -> PastScan:

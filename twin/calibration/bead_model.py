@@ -126,7 +126,7 @@ def with_contrast(model: BeadModel, scene: Scene | None) -> BeadModel:
 
 
 def _ball_of(balls: Sequence[Solid], centre: FloatArray) -> Solid:
-    """Give the ball whose centre is nearest."""
+    """Return the ball whose centre is nearest."""
     return min(balls, key=lambda ball: float(np.linalg.norm(_centre(ball) - centre)))
 
 

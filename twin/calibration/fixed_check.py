@@ -144,12 +144,12 @@ def check_fixed(
 
 
 def _centre(asked: CalibrationRequest) -> dict[str, float]:
-    """Give where the priors of a request are centred, in edge units."""
+    """Return the centres of a request's priors, in edge units."""
     return from_printed_reading(asked.start, asked.reading).to_edge()
 
 
 def _fixed_values(state: Calibration, asked: CalibrationRequest) -> dict[str, float]:
-    """Give the main parameters that are fixed, and the values that they are fixed at."""
+    """Return the fixed main parameters with their values."""
     centre, known = _centre(asked), priors_of(state.scans, asked)
     return {n: centre[n] for n in SIX if n not in asked.free and n not in known}
 
@@ -206,7 +206,7 @@ def _left_by_priors(
     loose_fit: FitResult,
     explained: Sequence[Finding],
 ) -> list[Finding]:
-    """Give the findings that are left where priors are off: those of the fit with wider ones."""
+    """Return the findings that remain with wider priors, where priors are off."""
     priors = loosened({**usual.priors, **priors_of(state.scans, usual)})
     left = explain(state, replace(usual, priors=priors), loose_fit)[1]
     moved = [f for f in explained if f.code == "bead_tolerance" and loose_fit.bead_prior_mm]

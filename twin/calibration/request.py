@@ -90,7 +90,7 @@ class CalibrationRequest:
 
 
 def priors_of(scans: Sequence[Scan], request: CalibrationRequest) -> dict[str, float]:
-    """Give every prior of the fit [mm, deg, 1]."""
+    """Return every prior of the fit [mm, deg, 1]."""
     return {n: w for n, w in stated_priors(scans, request).items() if w > 0}
 
 
@@ -102,7 +102,7 @@ def stated_priors(scans: Sequence[Scan], request: CalibrationRequest) -> dict[st
 
 
 def strain_prior(model: BeadModel, request: CalibrationRequest) -> Strain:
-    """Give the standard deviations of the phantom's stretches and shears [1]."""
+    """Return the standard deviations of the phantom's stretches and shears [1]."""
     return known_strain(model, request.free, request.priors, request.bead_tolerance_mm)
 
 

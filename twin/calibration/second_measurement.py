@@ -120,7 +120,7 @@ def _judge_confirmation(state: Calibration) -> list[Finding]:
 
 
 def _moved_px(state: Calibration, fit: FitResult, plans: Sequence[Windows]) -> float:
-    """Give how far a fit moved the bead that it moved most from where it was measured."""
+    """Compute the largest distance that a fit moved a bead from its measured place."""
     worst = 0.0
     for g, (scan, plan) in enumerate(zip(state.scans, plans, strict=True)):
         cone = scan.poses.cone_vec(fit.group_parameters[g])

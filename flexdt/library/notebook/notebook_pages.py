@@ -207,7 +207,7 @@ class _Drawing:
         )
 
     def point(self, place: npt.ArrayLike) -> tuple[float, float]:
-        """Give the pixel (right, down) of a place (x, y, z) [mm]."""
+        """Return the pixel (right, down) of a place (x, y, z) [mm]."""
         x, y, z = np.asarray(place, dtype=float) - self.middle
         slope = np.radians(ELEVATION_DEG)
         up = z * np.cos(slope) + y * np.sin(slope)
@@ -252,7 +252,7 @@ class _Drawing:
 
 
 def panel_corners(cone_vec: ConeVec, index: int) -> npt.NDArray[np.float64]:
-    """Give the corners of a view's panel, (4, 3) [mm].
+    """Return the corners of a view's panel, (4, 3) [mm].
 
     Args:
         cone_vec: with the detector's shape.
@@ -278,7 +278,7 @@ def _small(image: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def _grey(image: npt.NDArray[Any], low: float, high: float) -> npt.NDArray[np.uint8]:
-    """Give a small picture with `low` black and `high` white; NaN is black."""
+    """Return a small picture with `low` black and `high` white; NaN is black."""
     values = np.nan_to_num(_small(image).astype(np.float64), nan=low)
     return np.asarray(np.clip(255.0 * (values - low) / (high - low), 0, 255), dtype=np.uint8)
 

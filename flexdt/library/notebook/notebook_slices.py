@@ -18,7 +18,7 @@ AXES: Final = (("z", 0, "xy"), ("y", 1, "xz"), ("x", 2, "yz"))
 
 
 def layer_of(data: npt.NDArray[Any], axis: int, index: int) -> npt.NDArray[Any]:
-    """Give one layer of a volume (nz, ny, nx), the last axis to the right and the other up.
+    """Return one layer of a volume (nz, ny, nx), the last axis to the right and the other up.
 
     Args:
         data: the volume's values.
@@ -30,7 +30,7 @@ def layer_of(data: npt.NDArray[Any], axis: int, index: int) -> npt.NDArray[Any]:
 
 
 def window_of(values: npt.NDArray[Any], window: Sequence[float] | None) -> tuple[float, float]:
-    """Give the values of black and white.
+    """Return the values of black and white.
 
     Args:
         values: whose percentiles are taken where no window is given; NaN is left out.

@@ -43,7 +43,7 @@ def volume_widgets(widgets: Any, volume: Volume, window: Sequence[float] | None 
         pictures[name] = widgets.Image(format="png", width=WIDTH_PX)
 
     def draw(_: object = None) -> None:
-        """Draw all slices, each with lines where the two others lie."""
+        """Draw all slices, each with lines at the two others."""
         black, white = chosen.value
         places = {name: slider.value for name, slider in sliders.items()}
         for name, axis, across in AXES:

@@ -276,7 +276,7 @@ def _foreign_file(content: Folder) -> Path | None:
 
 
 def _other_scan(content: Folder) -> str:
-    """Say how a folder of another program's, or of anybody's images, is opened."""
+    """Explain how to open a folder of another program's images."""
     for form in SCAN_FORMATS:
         named = sorted(n for n in content.names if n.lower().endswith(form.endings))
         if named:

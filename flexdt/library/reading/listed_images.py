@@ -125,7 +125,7 @@ def listed(
 def _first_look(
     frames: Sequence[Frame], flats: Sequence[Path], full_scale: int | None
 ) -> list[str]:
-    """Say whether the first flat image is saturated, or the projection in the middle."""
+    """Check whether the first flat image is saturated, or the projection in the middle."""
     taken = [frame.path for frame in frames if frame.present and frame.path is not None]
     kinds = {FLAT_IMAGE: [*flats], RADIOGRAPHS: taken[len(taken) // 2 :]}
     return first_look({what: paths[0] for what, paths in kinds.items() if paths}, full_scale)

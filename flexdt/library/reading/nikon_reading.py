@@ -1,4 +1,4 @@
-"""Read Nikon's .xtekct and the TIFFs beside it.
+"""Read Nikon's .xtekct and its TIFFs.
 
 As CIL's NikonDataReader 25.0 reads it (Apache-2.0;
 https://github.com/TomographicImaging/CIL): images are seen from behind the panel, column

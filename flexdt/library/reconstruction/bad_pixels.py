@@ -17,7 +17,7 @@ from flexdt.twin.reconstruction.acquisition.rectify import on_its_side
 from flexdt.twin.reconstruction.consistency.pixels import BadPixels, bad_pixels
 
 MIN_VIEWS: Final = 12
-"""Smallest number of views in which bad pixels are told from a turning object."""
+"""Smallest number of views in which bad pixels are separable from a turning object."""
 MOST_KEPT_BYTES: Final = 128 << 20
 """Largest line integrals kept between the passes over them [bytes]; larger ones are
 recomputed."""

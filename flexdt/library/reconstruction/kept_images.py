@@ -91,7 +91,7 @@ class ImagesOnDisk:
         return out
 
     def close(self) -> None:
-        """Give the room on disk back."""
+        """Delete the file."""
         self._file.close()
 
     def _read_into(self, buffer: memoryview) -> int:

@@ -115,7 +115,7 @@ class VolumeRequest:
             `Polychromatic`); None for no correction.
         kV: of the scan, for `material` and `scatter_correction`; None is the voltage in the data
             set.
-        png: write the three middle slices beside the volume.
+        png: write the three middle slices next to the volume.
         weight: of the total variation (`tv`); None is its own default.
         scatter_correction: materials of the object: find their scatter and subtract it; None
             for no correction.
@@ -333,7 +333,7 @@ def reconstruct_dataset(
     Args:
         dataset: from `load_dataset`.
         out: the file: .tif, .nrrd, .mha, .nii.gz, .h5 or .zarr.
-        request: the volume; None is FDK of the whole field of view.
+        request: the volume; None is FDK of the entire field of view.
         parameters: correction; None is the one in force during the scan, if any.
         progress: called with the work done and the total.
         workers: make the slabs of FDK; they see the data set and `out` under the same paths. An

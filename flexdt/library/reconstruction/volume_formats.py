@@ -69,7 +69,7 @@ class VoxelPlaces:
 
     @property
     def grid(self) -> Grid:
-        """Give the grid of cubes.
+        """Grid of cubes.
 
         Raises:
             GeometryError: they are no cubes.
@@ -81,12 +81,12 @@ class VoxelPlaces:
 
     @property
     def voxel_mm(self) -> float:
-        """Give the edge of cubes [mm]; raises as `grid`."""
+        """Edge of cubes [mm]; raises as `grid`."""
         return self.grid.voxel_mm
 
     @property
     def bytes(self) -> int:
-        """Give the size of the values as float32."""
+        """Size of the values as float32."""
         return 4 * math.prod(self.shape)
 
     @property

@@ -1,7 +1,7 @@
 """Blur of the images and apparent size of the beads, estimated from the spots themselves.
 
 The profile that is fitted is an approximation, so the estimate is corrected by the same estimate
-from rendered beads. Without whole spots the assumed values are returned, marked as not seen.
+from rendered beads. Without complete spots the assumed values are returned, marked as not seen.
 """
 
 from __future__ import annotations

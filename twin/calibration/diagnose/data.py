@@ -105,7 +105,7 @@ def judge_frames(scan: Scan, looks: Sequence[FrameSpots], sought: SpotFinder) ->
 
 
 def _of_intensities(scan: Scan, sought: SpotFinder) -> str:
-    """Say so if the beads show once the images are taken for intensities."""
+    """Make a finding if beads are found once the images are taken for intensities."""
     looks = scan.frames.look(replace(sought, intensities=True))
     shown = sum(len(look.detections) > 0 for look in looks)
     if shown < SHOWN_AT_LEAST * len(looks):

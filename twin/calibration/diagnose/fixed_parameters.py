@@ -231,7 +231,7 @@ def judge_priors(loose: FitResult, exact: Container[str] = ()) -> PriorsJudged:
 
 
 def _other_pixels(fit: FitResult, dD_z: float) -> str:
-    """Say which pixels would look like a panel `dD_z` [mm] further away."""
+    """Describe the pixels that would look like a panel `dD_z` [mm] further away."""
     poses = fit.problem.poses
     pixel = float(np.median(np.linalg.norm(poses.u, axis=1)))
     sdd = float(np.median(poses.sdd))
@@ -274,12 +274,12 @@ def narrow_priors(judged: PriorsJudged) -> Finding:
 
 
 def _deviate(chance: float) -> float:
-    """Give the normal deviate that is as improbable."""
+    """Return the normal deviate that is as improbable."""
     return float(np.sqrt(chdtri(1, max(chance, 1e-300))))
 
 
 def _deviate_of(ratio: float, freedom: float) -> float:
-    """Give the normal deviate that is about as improbable as a deviation in sigmas.
+    """Return the normal deviate that is about as improbable as a deviation in sigmas.
 
     Source: Wallace, Annals of Mathematical Statistics 30 (1959) 1121; it has no largest value.
 
@@ -292,7 +292,7 @@ def _deviate_of(ratio: float, freedom: float) -> float:
 
 
 def _chance(square: float, count: int, freedom: float) -> float:
-    """Give the probability of a larger sum of squares in sigmas.
+    """Return the probability of a larger sum of squares in sigmas.
 
     Args:
         square: the sum.

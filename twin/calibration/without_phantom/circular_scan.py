@@ -73,7 +73,7 @@ class CircularScan:
         return replace(self.base, **dict(zip(FREE, values.tolist(), strict=False)))
 
     def view(self, values: FloatArray) -> FloatArray:
-        """Give the cone_vec row (12,) of the shared pose about the axis."""
+        """Return the cone_vec row (12,) of the shared pose about the axis."""
         return np.asarray(about_axis(self.pose, self.offsets(values)).rows[0])
 
     def column(self, values: FloatArray, row: float | None = None) -> float:
@@ -90,13 +90,13 @@ class CircularScan:
         return np.asarray(np.arctan2(source[:, 1], source[:, 0]))
 
     def source_row(self) -> float:
-        """Give the row of the plane in which the source turns, by the offsets in force."""
+        """Return the row of the plane in which the source turns, by the offsets in force."""
         shown = about_axis(self.pose, self.offsets(self.start))
         level = [[0.0, 0.0, float(shown.source[0, 2])]]
         return float(shown.project_points(level, self.shape)[0, 0, 1])
 
     def slopes(self, values: FloatArray, scales: FloatArray) -> FloatArray:
-        """Give the change of the column with each parameter, (k,)."""
+        """Return the change of the column with each parameter, (k,)."""
         steps = np.diag(0.1 * scales)
         return np.array(
             [(self.column(values + e) - self.column(values - e)) / (2 * e.sum()) for e in steps]
@@ -139,7 +139,7 @@ class CircularScan:
 
 
 def about_axis(poses: Poses, offsets: Offsets) -> ConeVec:
-    """Give the views, the rotation axis at the origin."""
+    """Return the views in a frame with the rotation axis at the origin."""
     foot = from_unity([offsets.tau_x, 0.0, offsets.tau_z]) - poses.mount
     return poses.cone_vec(offsets).moved(np.eye(3), -foot)
 

@@ -413,7 +413,7 @@ class ConjugateRays:
 
 
 def _left_out(moved: FloatArray, told: FloatArray) -> tuple[float, float]:
-    """Give a ratio of sums over sectors or rows (n,), and its sigma from leaving out each;
+    """Return a ratio of sums over sectors or rows (n,), and its sigma from leaving out each;
     inf where one has it all."""
     count = len(told)
     rest = told.sum() - told

@@ -88,7 +88,7 @@ def find_gap(
 
 
 def _certified(gap: Gap, profile: Profile, axis: float, smoothing: float) -> bool:
-    """Say whether both ends of rays agree with a gap that single frames show."""
+    """Check whether both ends of rays agree with a gap that single frames show."""
     beside = gap.column - 0.5 - axis
     step = profile.at(abs(beside))
     if abs(step.width) > SIGMAS * step.sigma:
@@ -97,7 +97,7 @@ def _certified(gap: Gap, profile: Profile, axis: float, smoothing: float) -> boo
 
 
 def _refuted(gap: Gap, profile: Profile, axis: float) -> bool:
-    """Say whether both ends of rays leave less than half of a gap that single frames show."""
+    """Check whether both ends of rays leave less than half of a gap that single frames show."""
     beside = gap.column - 0.5 - axis
     step = profile.at(abs(beside))
     return step.width * float(np.sign(beside)) + SIGMAS * step.sigma < gap.width / 2

@@ -105,7 +105,7 @@ class Evidence:
 
     @property
     def widths(self) -> FloatArray:
-        """Give the probabilities of the widths of a gap at each column, (w, c)."""
+        """Probabilities of the widths of a gap at each column, (w, c)."""
         return np.asarray(softmax(self.width + _LOG_PRIOR, axis=0))
 
 
@@ -148,7 +148,7 @@ def hidden_gap(
 
 
 def _gap_at(column: int, share: FloatArray) -> Gap:
-    """Give the gap at a column from the probabilities of its widths (w,)."""
+    """Return the gap at a column from the probabilities of its widths (w,)."""
     width = float(share @ WIDTHS_PX)
     spread = math.sqrt(float(share @ np.square(WIDTHS_PX - width)))
     return Gap(column, width, max(spread, float(local_sigma(width))))
@@ -244,7 +244,7 @@ def _beside_others(gains: FloatArray) -> Judged:
 
 
 def _log_student(deviation: FloatArray) -> FloatArray:
-    """Give the logarithm of Student's density but for a constant."""
+    """Return the logarithm of Student's density but for a constant."""
     return np.asarray(
         -(SCATTER_FREEDOM + 1.0) / 2.0 * np.log1p(np.square(deviation) / SCATTER_FREEDOM)
     )

@@ -398,7 +398,9 @@ def _closed(scan: CircularScan, turn: Turn, gap: Gap) -> tuple[CircularScan, Tur
 
 
 def _beside_rows(scan: CircularScan, rays: OppositeRays, roll_rad: float) -> float:
-    """Give how far the roll moves the axis in the panel's middle row, if others were read [px]."""
+    """Compute the motion of the axis in the panel's middle row by the roll, if other rows
+    were read [px].
+    """
     read = rays.frames.shape[1]
     return float(roll_rad * (rays.top - (scan.shape[0] - read) / 2) * (read > 1))
 

@@ -131,7 +131,7 @@ def local_gaps(
 
 
 def local_sigma(width: FloatArray | float) -> FloatArray:
-    """Give the standard deviation of a width that single frames show [px].
+    """Return the standard deviation of a width that single frames show [px].
 
     Sharper edges than the usual ones look like a wider gap: drawn ones are off by half of it.
     """
@@ -157,7 +157,7 @@ def _gains(edges: FloatArray, place: npt.NDArray[np.intp], shape: tuple[int, int
 
 
 def squares_by_distance(edges: FloatArray) -> PchipInterpolator:
-    """Give the mean square of the difference of two columns by their distance, 1 and more [px].
+    """Return the mean square of the difference of two columns by their distance, 1 and more [px].
 
     Args:
         edges: differences of neighbouring columns, (k, 2 SIDE - 1).
@@ -174,7 +174,7 @@ def squares_by_distance(edges: FloatArray) -> PchipInterpolator:
 def likelihood(
     edges: FloatArray, of_distance: PchipInterpolator, width: float, blur: float = 0.0
 ) -> FloatArray:
-    """Give the logarithm of the likelihood of each row of differences about a gap, (k,).
+    """Return the logarithm of the likelihood of each row of differences about a gap, (k,).
 
     Args:
         edges: differences of neighbouring columns, each row at its own scale, (k, 2 SIDE - 1).
