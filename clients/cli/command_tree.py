@@ -167,8 +167,7 @@ def build(words: Sequence[str] | None = None) -> typer.Typer:
 
     Args:
         words: of the command line, after the program's name. Of other distributions'
-            commands
-            only the named one is loaded, the others are listed. None loads all.
+            commands only the named one is loaded, the others are listed. None loads all.
     """
     app = typer.Typer(
         name="flexdt",

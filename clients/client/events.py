@@ -138,7 +138,7 @@ class AsyncSubscription:
 
     Attributes:
         topics: whose events come.
-        dropped: how many events went because nobody read them in time.
+        dropped: number of events dropped because they were not read in time.
     """
 
     def __init__(

@@ -179,7 +179,8 @@ def reset(stop: int | None = None) -> Flow[s.State]:
         stop: `safety.stop` of the state on which this is decided; None releases any stop.
 
     Raises:
-        RpcError: -32003, another stop has come since `stop`, or somebody else is the controller.
+        RpcError: -32003, another stop has come since `stop`, or another client is the
+            controller.
 
     Example:
         >>> twin.reset().safety.state
@@ -444,7 +445,7 @@ def projection(
         kind: line_integral (float32) or counts (uint16).
         binning: average so many pixels along each side, for a quick look.
         marks: also mark pixels that are saturated, starved or where the sample is cut off.
-        positions: motor -> [mm, deg] there, beyond its travel too; others stand as they do.
+        positions: motor -> [mm, deg] there, beyond its travel too; others keep their places.
         tube: as though set so: kV, power_W, on.
         camera: as though set so: exposure_ms, mode, roi, averages.
 
@@ -510,19 +511,19 @@ def predict_exposure(
     sdd_mm: float | None = None,
     detail: str = "void:0.5",
 ) -> Flow[images.ExposurePrediction]:
-    """Transmission, contrast to noise and dose of a circular scan.
+    """Estimate transmission, contrast to noise and dose of a circular scan.
 
     Args:
         sample: a shipped phantom or an upload; default: the one on the stage.
         kV, power_W, exposure_ms, averages, mode, roi: default: as they are set.
-        filter: MATERIAL:MM beside the machine's own.
+        filter: MATERIAL:MM in addition to the machine's own.
         frames: of the scan.
-        kind: of a scan to compose, whose time and bytes are told; default: those of the images.
+        kind: of a scan to compose, for its time and bytes; default: those of the images.
         sod_mm, sdd_mm: distances; default: the present ones.
-        detail: MATERIAL:MM or void:MM on the darkest ray, whose contrast is told.
+        detail: MATERIAL:MM or void:MM on the darkest ray, for its contrast.
 
     Raises:
-        RpcError: -32001, nothing stands on the stage, or a setting is beyond the machine's.
+        RpcError: -32001, nothing is on the stage, or a setting is beyond the machine's.
 
     Example:
         >>> told = twin.predict_exposure("lego", kV=60.0)
@@ -953,9 +954,9 @@ def fit_calibration(
             markers.
         priors: name -> standard deviation [mm, deg]; 0 is exactly known.
         per_frame: parameters that may also move.
-        steps: tell the covariance after so many parts of the frames.
-        residuals: tell those of every bead in every frame.
-        tracks: tell where beads were seen, and were put before and after.
+        steps: include the covariance after so many parts of the frames.
+        residuals: include those of every bead in every frame.
+        tracks: include the beads' places, seen, before and after the fit.
         markers: where beads were seen, (frame, bead, column, row, sigma) [px], sigma None where it
             is not known; default: they are detected in the images.
         scale: distance of two unknown markers [mm], "A-B=MM" or "A-B=MM+-SIGMA".

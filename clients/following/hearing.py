@@ -18,8 +18,7 @@ def heard(data: bytes, axes: Collection[str], stamp: str, late_s: float = 0.0) -
 
     Args:
         data: bytes of the message; UTF-8, or one byte for each character where a cluster
-            is not
-            UTF-8. A prefix of the object, such as a topic, is left out.
+            is not UTF-8. A prefix of the object, such as a topic, is left out.
         axes: motors and virtual axes of the machine.
         stamp: time of day, hh:mm:ss.mmm.
         late_s: uncertainty of the time: it may have come so much earlier [s].

@@ -250,7 +250,7 @@ async def sequence(twin: ConnectedTwin, command: c.TakeSequence, progress: Comma
     Returns:
         Text of ACK. The armed move ends with the job: with its reply, or with its error.
 
-    The twin decides by its own clock when each image is taken, so the frames lie where the
+    The twin decides by its own clock when each image is taken, so the frames are where the
     scanner's rule puts them, however slow the network is.
     """
     armed, twin.armed = twin.armed, None

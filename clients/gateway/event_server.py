@@ -373,7 +373,7 @@ def check_loopback(host: str) -> None:
     """Check that `host` is a loopback address.
 
     Raises:
-        AccessError: it is not; the message says what is allowed.
+        AccessError: it is not; lists the allowed ones.
     """
     if not is_loopback(host):
         raise AccessError(

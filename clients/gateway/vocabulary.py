@@ -1,6 +1,7 @@
 """The commands of the socket interface: the script's vocabulary and a few more.
 
-`read_command` turns an event into a typed command, or raises an error that lists what is allowed.
+`read_command` turns an event into a typed command, or raises an error
+that lists the allowed ones.
 """
 
 from __future__ import annotations

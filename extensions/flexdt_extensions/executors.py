@@ -124,8 +124,7 @@ def dask_executor(address: Any, tend: Tend | None = None) -> Iterator[Executor]:
     Args:
         address: of a scheduler, or a cluster object of dask.
         tend: called at each look at the workers while the work goes on; None prints where
-            there are
-            none.
+            there are none.
 
     Yields:
         Their executor.

@@ -110,10 +110,8 @@ def begin(
         free: parameters to estimate.
         start: offsets to begin with, on which the priors are centred.
         priors: standard deviations of other offsets [mm, deg, 1]; see `fit.priors`. None:
-            they are
-            exactly known, and sigmas are those of the images' noise alone, which more
-            frames can
-            lower.
+            they are exactly known, and sigmas are those of the images' noise alone, which
+            more frames can lower.
     """
     require_names(free)
     widths = require_widths(priors or {})

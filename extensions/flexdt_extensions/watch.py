@@ -71,8 +71,7 @@ def watch(
         job: its name; the current one if left out.
         free: parameters to estimate.
         priors: as of `flexdt calibrate`; None: the machine's, or the assumed ones of a
-            machine that
-            does not ship.
+            machine that does not ship.
         tell: called with the estimate after each frame.
 
     Returns:

@@ -91,8 +91,7 @@ def run_demo(
         truth_file: hidden misalignment; None draws one.
         tell: called with each line of progress.
         stay: start the viewer too; called with its URL when the work is done, and the
-            servers live
-            until it returns.
+            servers live until it returns.
 
     Returns:
         The document of `demo.json`.
@@ -330,7 +329,7 @@ def _compared(outcome: Outcome[DataSet], truth: Mapping[str, float], tell: Tell)
         tell: called with each line of progress.
 
     Returns:
-        Whether the truth lies inside the joint 95 % ellipsoid.
+        Whether the truth is inside the joint 95 % ellipsoid.
     """
     from flexdt.library.calibration.calibrate import inside_95
 

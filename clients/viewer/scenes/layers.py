@@ -23,8 +23,7 @@ class Layer:
         title: of its box on the page.
         shown: by default.
         nodes: names of its nodes in the scene, where `{part}` is replaced by each
-            component; none for
-            names, which each view has drawn for itself.
+            component; none for names, which each view has drawn for itself.
         near: show the components near a contact, whatever is chosen.
     """
 

@@ -29,8 +29,7 @@ class Augment:
 
     Attributes:
         photons: lowest and highest open-beam photons of a pixel (loguniform), whose noise
-            is added;
-            None adds none.
+            is added; None adds none.
         shift_px: standard deviation of the detector's shift along columns and rows, which
             `cone_vec_true` follows and `cone_vec_nominal` does not.
 

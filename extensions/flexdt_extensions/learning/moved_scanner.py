@@ -54,7 +54,7 @@ def choices(action: npt.ArrayLike, sizes: Sequence[int]) -> list[int]:
     list.
 
     Raises:
-        LimitError: says what is allowed.
+        LimitError: lists the allowed values.
     """
     values = np.atleast_1d(action).tolist()
     if len(values) != len(sizes) or any(

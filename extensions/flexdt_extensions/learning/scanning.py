@@ -53,9 +53,8 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
     Args:
         action, observation: see above.
         task: information (calibrate with the LEGO phantom; gain in nats), quality
-            (reconstruct a
-            random object; gain of 1 - RMSE / RMS), or plates (the same of parallel
-            plates).
+            (reconstruct a random object; gain of 1 - RMSE / RMS), or plates (the same of
+            parallel plates).
         frames: of an episode; then it is truncated.
         time_weight: reward lost per second of motion and exposure.
         dose_weight: reward lost per unit of dose (see `Lab.take`).

@@ -87,8 +87,7 @@ def measured_spread(
 
     Args:
         model: the beads; with a tolerance in `planned` each trial's beads are off by it,
-            and
-            parameters by their priors.
+            and parameters by their priors.
         planned: the scans.
         trials: fits.
         seed: of the noise.

@@ -61,8 +61,7 @@ class PlannedScans:
         bead_tolerance_mm: > 0: standard deviation of the beads' places; they are
             estimated, too.
         priors: standard deviations of the other parameters [mm, deg, 1], 0 exactly known;
-            None: as
-            `known` of `fit.priors` has it.
+            None: as `known` of `fit.priors` has it.
     """
 
     poses: Poses

@@ -76,11 +76,9 @@ class GroupTruth:
 
     Attributes:
         values: dO [mm], the phantom's angle in the first frame [deg], and the mount's
-            place in the
-            world at that frame [mm]; named as in `SIX`.
+            place in the world at that frame [mm]; named as in `SIX`.
         noise_px: for each SOD, noise of the detections on top of rounding to agree with
-            the logged
-            residuals at N = 360.
+            the logged residuals at N = 360.
     """
 
     values: FloatArray
@@ -142,8 +140,7 @@ def authors_fit(
         seen: detections (n, k, 2) [px], in the order of the beads.
         model: the beads.
         radius_px: of the blobs, whose centroids are predicted as those of whole pixels;
-            None
-            predicts points.
+            None predicts points.
     """
     start = math.radians(author()["real"]["scans"][name]["start_deg"])
     phi = start + 2.0 * math.pi * np.arange(len(seen)) / len(seen)

@@ -49,8 +49,7 @@ class Run:
         success: MAE below the thesis's limit.
         weak: weak and null directions, as text.
         beside: mae, iterations, cost_reduction_pct, success of the other method on the
-            same tracks,
-            or empty.
+            same tracks, or empty.
         note: why there is no result.
         method: of this result; the other one's is in `beside`.
         failed: it raised an error instead of stating why there is no result.

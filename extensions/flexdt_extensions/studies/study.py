@@ -197,16 +197,14 @@ def run_study(
     Args:
         experiment: beads, phantoms, damping, detector, real or basin.
         fidelity: points, noisy, clean or images; None is the experiment's own (points;
-            basin:
-            noisy).
+            basin: noisy).
         out: folder for summary.json, tables and heat maps; None writes nothing.
         jobs: processes; None is one for each core.
         scheduler: address of a dask scheduler to use instead of own processes.
         counts: numbers of projections; None is the thesis's. basin has one.
         seed: of all noise.
         variant: phantoms and scenarios of beads, phantoms and damping as the thesis
-            prints them
-            (printed), or as its author's public code has them (author).
+            prints them (printed), or as its author's public code has them (author).
         tell: called with a line of text after each task.
 
     Returns:
@@ -215,8 +213,7 @@ def run_study(
     Raises:
         UnknownNameError: no such experiment, or it has no such fidelity or variant.
         TwinError: counts were given for basin; dask.distributed is not installed; `out`
-            was given
-            and matplotlib is not installed.
+            was given and matplotlib is not installed.
         CommandError: the scheduler cannot be reached.
     """
     _require("no experiment", experiment, FIDELITIES)
