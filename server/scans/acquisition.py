@@ -155,7 +155,7 @@ class Acquisition:
         nominal = motor_poses(self.plan.machine, self.plan.profile, frame.camera, positions)
         exposures = [settings_of(e) for e in batch]
         images = await self.radiography.take(self.sample, nominal, frame.camera, exposures)
-        self.ensure_same()  # of what was projected, not of what stands there before
+        self.ensure_same()  # of the projected sample, not of the earlier one
         return images
 
     @cached_property

@@ -309,7 +309,7 @@ class Jobs:
         self._take_over()
         self._interrupted = reason
         runner = None if self.current is None else self.current.runner
-        # A paused job that is just being resumed is told to pause as well.
+        # A paused job that is just being resumed is paused as well.
         if runner is not None and not runner.paused:
             runner.pause(reason)
 

@@ -33,7 +33,7 @@ Produce = Callable[[Sequence[Exposure]], Awaitable[None]]
 Phase = Literal["running", "paused", "done"]
 
 
-# What a script's commands set on the scanner, one case for each type that sets something.
+# Effects of a script's commands on the scanner, one case for each type that sets something.
 #
 # Moves and images are the plan's business and have no effect here.
 
@@ -54,7 +54,7 @@ def apply_command(scanner: ScannerTwin, command: c.Command, now: float) -> None:
         case c.CameraSetting():
             scanner.set_camera(**command.arguments)
         case c.MotorCommand(component=axis) if not scanner.machine.has(axis):
-            pass  # a component of somebody else's
+            pass  # a component of another package
         case c.SetSpeed(component=axis, speed=speed):
             scanner.set_axis(axis, speed=_allowed(scanner, axis, speed, "max_speed"))
         case c.SetAcceleration(component=axis, acceleration=rate):
@@ -158,7 +158,7 @@ class ScanRunner:
             self._set(error=error)
         if self._kept is None:
             self._kept = _Settings.of(self.scanner)
-        # Whatever is commanded next, the run stops first: the motors may stand by now.
+        # The run stops before any further command: the motors may be at rest by now.
         self._pause, self._stop_due, self._stepping = True, True, False
         self._wake()
 
@@ -226,11 +226,11 @@ class ScanRunner:
                     case Exposure():
                         await self._until(moment)
                         # A frame that a pause falls into is discarded: the run goes back before
-                        # it and exposes it whole, at the speed of the scan.
+                        # it and exposes it completely, at the speed of the scan.
                         await self._until(moment + event.duration_s, exposing_since=moment)
                         steps = self._steps
                         await self._put(event)
-                        # A step asked for while the frame waited for room is for the next frame.
+                        # A step requested while the frame waited for room is for the next frame.
                         length = event.duration_s if steps == self._steps else 0.0
                 if self._stepping and length > 0.0:
                     await self._until(moment + length)

@@ -258,7 +258,7 @@ class Submissions:
                 begin = replace(asked.begin, start=self.start(), sample=self.scanner.sample)
                 begun = replace(asked, begin=begin)
                 self.jobs.shows(begin.sample)
-            # The sample's file and the correction may be others by now; then it is checked anew.
+            # The sample's file and the correction may be others by now; then it is checked again.
             final = await self.checks.sound(
                 await self._matter(begun.wish, begun.begin.start, begun.begin.sample)
             )
@@ -306,7 +306,7 @@ class Submissions:
         task = asyncio.create_task(each())
         self._predicting.add(task)
         task.add_done_callback(self._predicting.discard)
-        # What is sent to the projector meanwhile, the scan needs as well: it is not cancelled.
+        # The data sent to the projector meanwhile are needed by the scan as well: no cancelling.
         done, _ = await asyncio.wait({task}, timeout=PREDICTION_PATIENCE_S)
         return task.result() if done else [None] * len(probes)
 
@@ -371,7 +371,7 @@ class Submissions:
         for block in record.blocks:
             pixel = block.camera.pixels_mm(plan.machine.detector.pixels)
             check_cone_vec(record.cone_vec([block]), pixel)
-        # First what a resume must repeat, then the folder: killed in between, nothing is lost.
+        # First the conditions of a resume, then the folder: killed in between, nothing is lost.
         asked.write(self.root, name)
         writer = DatasetWriter(self.root, record, script=asked.wish.script, resume=resume)
         acquisition = Acquisition(

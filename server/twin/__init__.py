@@ -1,1 +1,1 @@
-"""The twin server: one scanner, its clients, and what they subscribe to."""
+"""The twin server: one scanner, its clients and their subscriptions."""

@@ -1,8 +1,8 @@
 """The twin server as an application behind the TCP shell: connections to sessions to handlers.
 
-A session checks who may command, calls the handler of the method, and turns the twin's exceptions
-into the wire's errors. What a method does is in `handlers`. The pages for monitoring say how the
-twin is; what the scanner does in detail is in `state.get`.
+A session checks who may command, calls the handler of the method, and turns the twin's
+exceptions into the wire's errors. The methods are in `handlers`. The pages for monitoring
+show the twin's health; the scanner's details are in `state.get`.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class TwinSession:
         """Answer one call.
 
         Raises:
-            RpcError: what the wire says of it.
+            RpcError: the wire's form of any error.
         """
         twin, client = self._twin, self._client
         twin.control.heard(client.name)
@@ -62,7 +62,7 @@ class TwinSession:
     def close(self) -> None:
         """Unsubscribe the ended connection, release its control and cancel its way."""
         if self._twin.control.holder == self._client.name:
-            self._twin.detours.cancel()  # what the controller planned ends with the present leg
+            self._twin.detours.cancel()  # the controller's way ends with the present leg
         self._twin.hub.drop(self._client.peer)
         self._twin.control.release(self._client.name)
         self._twin.feed.changed()

@@ -75,7 +75,7 @@ class ControlLease:
     """The controller's lease; `holder` is a connection's name or None.
 
     Args:
-        idle_s: a controller that has asked for nothing for so long gives way to whoever asks [s].
+        idle_s: silence after which a controller gives way to another client [s].
         clock: real time [s].
     """
 
@@ -92,10 +92,10 @@ class ControlLease:
             self._heard = self._clock()
 
     def require(self, who: str, what: str) -> None:
-        """Let `who` move: it holds control, or nobody does and it takes it.
+        """Check that `who` may move: it has control, or takes it if it is free.
 
         Raises:
-            RpcError: -32003, somebody else is the controller.
+            RpcError: -32003, another client is the controller.
         """
         expired = self._clock() - self._heard > self._idle_s
         if self.holder is None or expired:
@@ -105,10 +105,11 @@ class ControlLease:
             raise self._taken(what)
 
     def ensure_allowed(self, who: str, what: str) -> None:
-        """Let `who` go on after a wait: nobody else has become the controller meanwhile.
+        """Check after a wait that `who` may still move: no other client has taken
+        control.
 
         Raises:
-            RpcError: -32003, somebody else is the controller.
+            RpcError: -32003, another client is the controller.
         """
         if self.holder not in (None, who):
             raise self._taken(what)
@@ -119,7 +120,7 @@ class ControlLease:
             self.holder = None
 
     def force(self, who: str) -> str | None:
-        """Take control from whoever has it; returns who lost it."""
+        """Take control from its present holder, which is returned."""
         loser = self.holder if self.holder != who else None
         self.holder = who
         self.heard(who)
@@ -142,14 +143,16 @@ class TwinServer:
         root: the data directory.
         truth: hidden misalignment.
         speed_up: of the clock at start.
-        seed: makes the noise's seed of each scan; a function that returns None switches noise off.
+        seed: makes the noise's seed of each scan; a function that returns None switches
+            noise off.
         limits: of jobs, uploads, disk, control.
         physics, scatter: how images are made, see `radiography`.
         projectors: servers behind `projector`.
         wall: real time [s], monotonic; a simulation has its own.
         memory_limit: of the samples in memory [bytes]; None for any.
         projector_room: bytes that a projector can have for a sample; None if not known.
-        projector_watch: says why no image can be computed; None where nothing is watched.
+        projector_watch: gives the reason why no image can be computed; None without a
+            watch.
     """
 
     def __init__(
@@ -486,12 +489,14 @@ class TwinServer:
         self.jobs.interrupt(SafetyError(f"{what} was commanded; resume goes on", {"asked": what}))
 
     def tell(self, level: w.LogLevel, message: str, **data: object) -> None:
-        """Say something to whoever listens to the topic `log`, and to the server's log."""
+        """Publish a message on the topic `log` and in the server's log."""
         log(message, LEVELS[level], error=False, **data)
         self._publish_log(level, message, data)
 
     def _noticed_disk(self, problem: str | None) -> None:
-        """Tell everybody that what changes is not on the disk, or that it is again."""
+        """Notify all clients that changes cannot be saved, or that they can be saved
+        again.
+        """
         if problem is None:
             self.tell("info", "the state is on the disk again")
         else:

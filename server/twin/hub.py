@@ -1,11 +1,12 @@
-"""Who hears what: events of the topics state, projection, job and log to their subscribers.
+"""Delivery of events of the topics state, projection, job and log to their subscribers.
 
-Each event is rendered once per view (an image as line integrals or counts, binned or not) however
-many subscribers there are. A subscriber's rate limit keeps the newest value of each slot; a client
-that does not read is its own connection's business (see `tcp`). `seq` counts the events of a topic,
-so a gap tells what was skipped. Of some topics the last events are kept for those who come late,
-who get them with the `seq` and time they had, none of them twice. Events to many go out in slices,
-in order for each, so that no request waits for hundreds of them.
+Each event is rendered once per view (an image as line integrals or counts, binned or not)
+however many subscribers there are. A subscriber's rate limit keeps the newest value of
+each slot; a client that does not read is its own connection's business (see `tcp`). `seq`
+counts the events of a topic, so a gap shows skipped events. The last events of some
+topics are kept for late subscribers, who get them with their original `seq` and time,
+each once. Events to many go out in slices, in order for each, so that no request waits
+for hundreds of them.
 """
 
 from __future__ import annotations

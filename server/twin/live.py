@@ -1,8 +1,9 @@
-"""What watchers see while nobody scans: images of the pose of the moment, and the state.
+"""Live images of the present pose while no scan runs, and the state.
 
-Any change asks for one projection, always of the newest pose; what is stale is never computed.
-While an axis moves projections flow, and the last one is the final pose's. The state goes out on
-every change and regularly during motion. Nothing is computed while nobody watches.
+Any change requests one projection, always of the newest pose; stale ones are never
+computed. While an axis moves projections flow, and the last one is the final pose's. The
+state is published on every change and regularly during motion. Nothing is computed
+without subscribers.
 """
 
 from __future__ import annotations
@@ -231,13 +232,13 @@ class LiveView:
         return images[0], cone
 
     def judge(self, radiograph: Radiograph, shot: Shot) -> None:
-        """Take an image that a scan made for what `seen` is about."""
+        """Take a scan's image as the one that `seen` describes."""
         self._seen = (radiograph, shot)
 
     @property
     def seen(self) -> ImageFlags | None:
         """Flags of the last image, such as saturation."""
-        if isinstance(self._seen, tuple):  # judged once, when somebody asks
+        if isinstance(self._seen, tuple):  # computed at the first access
             image, shot = self._seen
             self._seen = flags_of(self.radiography, image, shot.camera, shot.exposure, shot.time)
         return self._seen
@@ -262,7 +263,7 @@ class LiveView:
         self.hub.publish("projection", lambda view: made.get(view) or make(view), time=shot.time)
 
     def publish(self, radiograph: Radiograph, cone: ConeVec, shot: Shot) -> None:
-        """Send an image that a scan has made to whoever watches; the newest one wins."""
+        """Publish a scan's image to the subscribers; the newest one replaces older ones."""
         self._made = (radiograph, cone, shot)
         if self._showing is None or self._showing.done():
             self._showing = asyncio.create_task(self._show_made())
@@ -280,7 +281,7 @@ class StateFeed:
     Attributes:
         scanner, clock, hub: see their modules.
         render: makes the state.
-        job_runs: whether a scan decides how time goes on.
+        job_runs: whether a scan controls the time.
     """
 
     scanner: ScannerTwin

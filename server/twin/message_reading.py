@@ -1,6 +1,6 @@
 """Large messages are decoded and their parameters validated in a worker process, not on the loop.
 
-Decoding 15 MB of JSON, or saying what is wrong with them, holds an interpreter for seconds. What
+Decoding 15 MB of JSON, or describing their errors, holds an interpreter for seconds. What
 comes back is small, or bytes: parameters of a call are unpickled when its turn comes.
 """
 

@@ -67,7 +67,7 @@ def parameters_of(row: FloatArray, view: int = 0) -> tuple[float, ...]:
     if math.hypot(normal[0], normal[2]) > 1e-9:
         gantry = math.atan2(normal[0], normal[2])
         turn = math.atan2(u[1], v[1])
-    else:  # the panel lies flat: only the sum of the two other angles counts
+    else:  # the panel is horizontal: only the sum of the two other angles counts
         gantry, turn = math.atan2(-u[2], u[0]), 0.0
     axes = rotation_y(gantry) @ rotation_x(out) @ rotation_z(turn)
     s, d = axes.T @ source, axes.T @ centre
@@ -119,7 +119,7 @@ def read_rtk(
     if root.tag != _ROOT or root.get("version") != VERSION:
         said = f"{file}: {root.tag} version {root.get('version')}"
         raise ExchangeError.instead(said, root.tag, f"{_ROOT} version {VERSION}")
-    common = dict.fromkeys(NAMES, 0.0)  # what RTK writes before the views holds for all
+    common = dict.fromkeys(NAMES, 0.0)  # numbers before the views hold for all
     rows: list[FloatArray] = []
     stated: list[tuple[float, float]] = []
     for element in root:

@@ -62,7 +62,7 @@ def grid_findings(
     shown = beside & ahead
     if (shown & before).any():
         shown = shown & before
-    elif shown.mean(axis=0).max() < BEHIND:  # a panel before the whole object is a virtual one
+    elif shown.mean(axis=0).max() < BEHIND:  # a panel before the complete object is a virtual one
         shown = np.zeros_like(shown)
     times = shown.mean(axis=0)
     if not times.any() and not _crossed(at, ahead & before, shape):

@@ -186,7 +186,7 @@ def _bias_of(scan: CoarseScan) -> Bias:
     truncation = scan.truncation
     if truncation is not None and truncation.cut_off.any():
         ways = [(truncation.otherwise, SAFETY)]
-        if truncation.explained:  # but what the prisms leave at the edges is as unknown as ever
+        if truncation.explained:  # but the prisms' residual at the edges is as unknown as ever
             ways = [(truncation.otherwise, TRUSTED), (truncation.later, SAFETY)]
         for way, share in ways:
             other = np.nan_to_num(scan.fdk(scan.images, scan.cone_vec, way))

@@ -184,7 +184,7 @@ class CoarseScan:
         """Voxel columns outside some views, (ny, nx) bool."""
         x, y, _ = self.grid.centers()
         away = np.hypot(x - self.circle.centre[0], (y - self.circle.centre[1])[:, None])
-        # A voxel and a half. Nodes lie at just that distance; rounding shall not decide on them.
+        # A voxel and a half. Nodes are at just that distance; rounding shall not decide on them.
         return np.asarray(away > max(self.ends) - 1.49 * self.grid.voxel_xyz[0])
 
     @cached_property
@@ -265,7 +265,7 @@ class CoarseScan:
         # As far behind the object as the source is before it: twice as large.
         panel, down = centre - far + u * (ends[1] - ends[0]), (0.0, 0.0, -2.0 * tall)
         views = ConeVec.from_vectors(centre + far, panel, 2.0 * side * u, [down] * len(u))
-        cols = int(sum(ends) / side + 1e-6) + 2  # often a whole number, but for its rounding
+        cols = int(sum(ends) / side + 1e-6) + 2  # often an integer, except for rounding
         return Rung(flaw, views, (self.grid.shape[0] + 2 * self.more, cols))
 
     def ladder(self) -> list[Rung]:

@@ -365,7 +365,7 @@ def volume_of(stack: Float32Array, cone_vec: ConeVec, grid: Grid) -> Volume:
     volume = fdk_parts(
         lambda: [stack], cone_vec, shape, grid, "hann", None, truncation, outside=True
     )
-    return replace(volume, data=np.nan_to_num(volume.data))  # what no view sees scatters nothing
+    return replace(volume, data=np.nan_to_num(volume.data))  # voxels without a view scatter nothing
 
 
 def shape_of(stack: Float32Array) -> tuple[int, int]:

@@ -129,7 +129,7 @@ async def change_settings(
     def take() -> None:
         ready()
         change(twin.scanner)
-        twin.changed()  # here: who asked may be gone when this is kept
+        twin.changed()  # here: the client may be gone when this is saved
 
     await twin.keeper.keep(take, after)
 

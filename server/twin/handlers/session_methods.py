@@ -56,7 +56,7 @@ def control(twin: TwinServer, client: Client, params: p.Control) -> p.ControlRes
     twin.feed.changed()
     holder = twin.control.holder
     if before is not None and holder != before:
-        twin.detours.cancel()  # what the last controller planned ends with the present leg
+        twin.detours.cancel()  # the last controller's way ends with the present leg
     return p.ControlResult(controller=holder, yours=holder == client.name)
 
 

@@ -202,8 +202,8 @@ def draw_row(line, forms, flips, plane, r, c0, c1):
 
 @kernel
 def draw_triangle(sums, p, pixels, face, g, row0, row1, cols, forms, flips, plane):
-    """Draw one triangle onto rows row0 to row1 - 1. pixels (k, 3): column, row and whether the
-    vertex lies in front of the source.
+    """Draw one triangle onto rows row0 to row1 - 1. pixels (k, 3): column, row and
+    whether the vertex is in front of the source.
     """
     i, j, k = face[0], face[1], face[2]
     front = pixels[i, 2] + pixels[j, 2] + pixels[k, 2]

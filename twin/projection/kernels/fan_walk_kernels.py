@@ -184,7 +184,7 @@ def cross_levels(flat, grid, fan, rays, work, j, r0, r1, share):
         while True:
             after = np.uint32(np.int32(level) + step)
             here, there = ZERO, ZERO
-            # Unsigned: level 0 becomes a large number, so one comparison means both lie inside.
+            # Unsigned: level 0 becomes a large number, so one comparison checks both.
             if min(level, after) - ONE < both:
                 if first:
                     here = flat[at0 + np.uint64(level)] - flat[at0 + np.uint64(after)]
@@ -515,7 +515,7 @@ def walk(flat, spans, grid, fan, rays, work, n, transposed):
         if fan.j0 > 0:
             # The vertices of a plane reach into the slab before it.
             open_slab(flat, spans, grid, fan.j0 - 1, r0 - 1, r0 + 1)
-    # One slab more than there are: its vertices lie on the far side of the last slab.
+    # One slab more than there are: its vertices are on the far side of the last slab.
     for j in range(fan.j0, fan.j1 + 1):
         if (j - fan.j0) % SETTLED == SETTLED - 1:
             if transposed:

@@ -273,7 +273,7 @@ def truncation_of(
         ]
     if shape[1] < 2:
         return None
-    # Beyond the near edge of a panel moved to one side the opposite views say what is there.
+    # Beyond the near edge of a panel moved to one side the opposite views have the data.
     before, after = columns_beyond(circle, panels, shape[1])
     edges = np.array([before <= 1, after <= 1]) | (not circle.full)
     found = _fitted(images, panels, shape, edges, helix=bool(circle.rise))

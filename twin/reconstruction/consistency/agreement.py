@@ -183,7 +183,7 @@ class _Trial:
         return float((shown.misfit(ALL_NOISE) / expected)[1 if self.telling[1] else 0])
 
     def _tried(self, suspect: Suspect) -> _Tried:
-        # What explains a scan explains why it seemed cut off.
+        # The explanation of a scan also explains why it seemed cut off.
         shown = Reprojection.of(self.scan, suspect.images, suspect.cone_vec, None)
         if shown is None:
             return _Tried(suspect, None, np.inf)

@@ -45,8 +45,8 @@ LASTING: Final = 0.75
 """Least share of the views in which a dead or hot pixel deviates; a bead at the turn
 of its orbit does so in less than half of them."""
 CHANGING: Final = 0.25
-"""Least number of changes between deviating and not, over the views, of a flickering
-pixel; an object's feature comes and goes once."""
+"""Least share of views at which a flickering pixel changes between deviating and not;
+an object's feature comes and goes once."""
 MOST_PART: Final = 0.05
 """Largest share of bad pixels; above it none is bad: the images are of another kind."""
 

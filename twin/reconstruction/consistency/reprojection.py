@@ -80,7 +80,7 @@ class Reprojection:
     def _powers(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Mean squares of residual, images and noise: of the values, and of their changes, (2,)."""
         rest = self.again - self.images
-        # What differs between neighbours in both is the object's.
+        # Differences between neighbours in both are the object's.
         noise = MORE_NOISE * max(_noise_of(self.images) - _noise_of(self.again), 0.0)
         residual, signal = (
             np.array([_mean_square(what), _mean_square(_changes(what))])
