@@ -37,12 +37,14 @@ function table(parameters, sigmas = {}, units = {}) {
         return el("tr", {}, el("td", {}, MEANS[k] ?? k, MEANS[k] ? el("span", { class: "muted small-text" }, ` ${k}`) : null), el("td", { class: "n" }, fixed(v, d)), el("td", { class: "n muted" }, sigma > 0 ? `± ${fixed(sigma, d)}` : ""), el("td", { class: "muted" }, (units[k] ?? unit(k)).replace(/^1$/, "")));
     }));
 }
+// Says whether the correction is in force.
 export async function apply(parameters, source, comment = "") {
     const answer = await command("calibration.apply", { parameters, source, comment }, "Not applied");
     if (!answer)
-        return;
+        return false;
     emit("note", "good", "Correction", `${answer.correction?.name ?? "correction"} is in force`); // warnings come by the log
     void refresh();
+    return true;
 }
 async function remove(name) {
     if (!(await command("calibration.delete", { name }, `${name} stays`)))
@@ -67,7 +69,7 @@ export async function refresh() {
     if (!answer.corrections.length)
         box.append(el("div", { class: "muted" }, "none yet"));
     for (const c of [...answer.corrections].reverse()) {
-        const again = () => apply(c.parameters, c.source, `again: ${c.name}`);
+        const again = () => void apply(c.parameters, c.source, `again: ${c.name}`);
         box.append(el("div", {}, el("span", { title: c.comment }, c.name), el("span", { class: "muted small-text" }, dated(c)), ...(c.name === answer.current ? [el("b", {}, "in force")] : [
             el("button", { class: "small", onclick: again }, "apply"), el("button", { class: "small", onclick: () => remove(c.name) }, "delete")
         ])));

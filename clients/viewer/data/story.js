@@ -1,16 +1,17 @@
-// Misalign: the thesis as a story in five steps. The scanner is told a wrong geometry, a scan shows what that does to a
-// volume, the bead phantom tells the right one, and a second scan is sharp again. Images are the same with a part that
-// is displaced and with a reconstruction that believes it displaced: so nothing has to be bent.
+// Misalign: the thesis as a story in five steps. The scanner is told a wrong geometry, a
+// scan shows what that does to a volume, the bead phantom tells the right one, and a second
+// scan is sharp again. Images are the same with a part that is displaced and with a
+// reconstruction that believes it displaced: so nothing has to be bent.
 import { $, clicks, el, fixed, setText, words } from "./dom.js";
 import { call, command, emit, on, store } from "./link.js";
 import { apply } from "./calibrate.js";
 import { folder } from "./data.js";
 import { scanIt } from "./scan_it.js";
 const PHANTOM = "lego";
-// What is estimated: the usual parameters, and the panel's roll. Beads hardly tell its tilt from their height.
+// What is estimated: the usual parameters, and the panel's roll. Beads hardly tell its tilt
+// from their height.
 const FREE = ["dO_x", "dO_y", "dO_z", "alpha", "tau_x", "tau_z", "det_roll"];
 const COMMENT = "misaligned by hand";
-// Offset -> what it is, its unit, the largest and the first value of its slider, what it does to a volume.
 const TRUTH = {
     dO_x: ["axis aside", "mm", 1, 0.5, "edges double, balls become arcs"],
     det_roll: ["panel rolled", "°", 3, 1, "slices shear, worse away from the middle"],
@@ -18,13 +19,16 @@ const TRUTH = {
     dS_x: ["source aside", "mm", 1, 0, "edges double, as of the axis"],
 };
 const STEPS = [
-    ["story-bend", "1  Misalign", "Choose how wrong the geometry is; the bead phantom goes onto the stage."],
+    ["story-bend", "1  Misalign",
+        "Choose how wrong the geometry is; the bead phantom goes onto the stage."],
     ["story-scan", "2  Scan it", "One turn, reconstructed with the wrong geometry."],
     ["story-fit", "3  Calibrate", "The phantom's beads tell where axis, panel and source are."],
     ["story-apply", "4  Apply", "What was found comes into force."],
-    ["story-again", "5  Scan it again", "The same turn, the right geometry. Share it from the volume."],
+    ["story-again", "5  Scan it again",
+        "The same turn, the right geometry. Share it from the volume."],
 ];
 let step = 0;
+let job = null;
 let dataset = null;
 let found = null;
 let waiting = false;
@@ -33,12 +37,17 @@ const slider = (name) => $(`#story-${name}`);
 const [first] = STEPS[0];
 const card = el("details", { class: "card", id: "story" }, el("summary", {}, "Misalign: what a wrong geometry does, in five steps"), ...Object.entries(TRUTH).map(([name, [what, unit, most, start, does]]) => el("div", { title: does }, el("label", { for: `story-${name}` }, `${what} `, el("output", { id: `story-${name}-is`, class: "mono" }), ` ${unit}`), el("input", {
     type: "range", id: `story-${name}`, min: -most, max: most, step: most / 50, value: start,
-    oninput: () => told(),
+    oninput: () => says(),
 }))), ...STEPS.map(([id, button]) => el("button", { id, class: "small", disabled: id !== first }, button)), el("div", { id: "story-says", class: "small-text", "aria-live": "polite" }), el("div", { id: "story-found", class: "small-text mono" }));
 $("#tab-calibrate").prepend(card);
-function told() {
-    for (const name of Object.keys(TRUTH))
-        setText($(`#story-${name}-is`), fixed(slider(name).valueAsNumber, 2));
+function chosen() {
+    const names = Object.keys(TRUTH);
+    return Object.fromEntries(names.map((name) => [name, slider(name).valueAsNumber]));
+}
+function says() {
+    for (const [name, value] of Object.entries(chosen())) {
+        setText($(`#story-${name}-is`), fixed(value, 2));
+    }
 }
 function show(says = STEPS[step]?.[2] ?? "") {
     STEPS.forEach(([id], k) => {
@@ -53,7 +62,10 @@ function next() {
     step += 1;
     show(step < STEPS.length ? undefined : `Sharp again. ${compared()}`);
 }
-const compared = () => `Rms difference from the truth: ${rms.map((one) => `${fixed(one, 5)} /mm`).join(", then ")}.`;
+function compared() {
+    const values = rms.map((one) => `${fixed(one, 5)} /mm`).join(", then ");
+    return `Rms difference from the truth: ${values}.`;
+}
 function failed(why) {
     waiting = false;
     show(why);
@@ -62,18 +74,20 @@ async function bend() {
     step = 0;
     rms.length = 0;
     setText($("#story-found"), "");
-    const parameters = Object.fromEntries(Object.keys(TRUTH).map((name) => [name, slider(name).valueAsNumber]));
+    const wrong = { parameters: chosen(), source: null, comment: COMMENT };
     if (!(await command("sample.set", { name: PHANTOM }, "The sample stays")))
         return;
-    if (!(await command("calibration.apply", { parameters, source: null, comment: COMMENT }, "Not applied")))
+    if (!(await command("calibration.apply", wrong, "Not applied")))
         return;
     next();
 }
 async function scan() {
     waiting = true;
     show("Scanning; the volume grows in the scene.");
-    if (!(await scanIt()))
-        failed("The scan did not begin.");
+    dataset = null;
+    job = await scanIt(PHANTOM);
+    if (!job)
+        failed("The scan did not begin: the note says why.");
 }
 async function fit() {
     if (!dataset)
@@ -95,7 +109,9 @@ async function fit() {
     const { parameters } = report;
     const rows = Object.entries(TRUTH).map(([name, [what, unit]]) => {
         const one = parameters[name];
-        const seen = one ? `found ${fixed(one.value, 3)} ± ${fixed(one.sigma, 3)} ${unit}` : "not estimated: back to nominal";
+        const seen = one
+            ? `found ${fixed(one.value, 3)} ± ${fixed(one.sigma, 3)} ${unit}`
+            : "not estimated: back to nominal";
         return el("div", {}, `${what}: told ${fixed(slider(name).valueAsNumber, 2)} ${unit}, ${seen}`);
     });
     $("#story-found").replaceChildren(...rows);
@@ -104,18 +120,19 @@ async function fit() {
 async function use() {
     if (!found || !dataset)
         return;
-    await apply(found, dataset, "after a story");
-    next();
+    if (await apply(found, dataset, "after a story"))
+        next();
 }
-on("job", (job) => {
-    if (!waiting || (step !== 1 && step !== 4))
+on("job", (told) => {
+    if (!waiting || told.job !== job)
         return;
-    if (job.state === "done") {
-        dataset = folder(job);
+    if (told.state === "done") {
+        dataset = folder(told);
         show("Reconstructing, and comparing with the truth …");
     }
-    else if (["failed", "aborted", "incomplete"].includes(job.state))
-        failed(`The scan is ${job.state}.`);
+    else if (["failed", "aborted", "incomplete"].includes(told.state)) {
+        failed(`The scan is ${told.state}.`);
+    }
 });
 on("volume", (volume) => {
     if (!waiting || !volume.past || volume.name !== dataset)
@@ -132,10 +149,18 @@ on("volume", (volume) => {
     if (step === 2)
         show(`${compared()} ${STEPS[2][2]}`);
 });
-on("connection", () => { if (!store.twin && waiting)
-    failed("The connection was lost meanwhile."); });
-clicks({ "story-bend": bend, "story-scan": scan, "story-fit": fit, "story-apply": use, "story-again": scan });
-told();
+on("connection", () => {
+    if (!store.twin && waiting)
+        failed("The connection was lost meanwhile.");
+});
+clicks({
+    "story-bend": bend,
+    "story-scan": scan,
+    "story-fit": fit,
+    "story-apply": use,
+    "story-again": scan,
+});
+says();
 show();
 export function open() {
     emit("show-tab", "calibrate");

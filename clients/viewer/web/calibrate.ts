@@ -39,11 +39,13 @@ function table(parameters: Parameters, sigmas: Record<string, number | null> = {
       el("td", { class: "n muted" }, sigma > 0 ? `± ${fixed(sigma, d)}` : ""), el("td", { class: "muted" }, (units[k] ?? unit(k)).replace(/^1$/, "")));
   }));
 }
-export async function apply(parameters: Record<string, number>, source: string | null, comment = ""): Promise<void> {
+// Says whether the correction is in force.
+export async function apply(parameters: Record<string, number>, source: string | null, comment = ""): Promise<boolean> {
   const answer = await command("calibration.apply", { parameters, source, comment }, "Not applied");
-  if (!answer) return;
+  if (!answer) return false;
   emit("note", "good", "Correction", `${answer.correction?.name ?? "correction"} is in force`); // warnings come by the log
   void refresh();
+  return true;
 }
 async function remove(name: string) {
   if (!(await command("calibration.delete", { name }, `${name} stays`))) return;
@@ -65,7 +67,7 @@ export async function refresh(): Promise<void> {
   box.textContent = "";
   if (!answer.corrections.length) box.append(el("div", { class: "muted" }, "none yet"));
   for (const c of [...answer.corrections].reverse()) {
-    const again = () => apply(c.parameters, c.source, `again: ${c.name}`);
+    const again = () => void apply(c.parameters, c.source, `again: ${c.name}`);
     box.append(el("div", {},
       el("span", { title: c.comment }, c.name), el("span", { class: "muted small-text" }, dated(c)),
       ...(c.name === answer.current ? [el("b", {}, "in force")] : [

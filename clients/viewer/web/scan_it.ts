@@ -1,5 +1,6 @@
-// "Scan it": one turn of what stands on the stage. The sample fills the image, the views follow from its size, the
-// volume grows in the scene meanwhile and then stands beside its truth.
+// "Scan it": one turn of what stands on the stage. The sample fills the image, the views
+// follow from its size, the volume grows in the scene meanwhile and then stands beside its
+// truth.
 import { $, $button, $select, clicks, el, setText } from "./dom.js";
 import { command, call, emit, on, store } from "./link.js";
 import { folder } from "./data.js";
@@ -53,24 +54,25 @@ async function script(state: State): Promise<Answers["viewer.compose"] | null> {
     const found = made && (await call("script.check", { text: made.text }).catch(() => null));
     if (found?.ok) return made;
   }
-  return command("viewer.compose", { kind: "fly", frames: LEAST_VIEWS, exposure_ms: EXPOSURE_MS }, "No scan");
+  const least = { kind: "fly" as const, frames: LEAST_VIEWS, exposure_ms: EXPOSURE_MS };
+  return command("viewer.compose", least, "No scan");
 }
-// Says whether a scan has begun.
-export async function scanIt(): Promise<boolean> {
+// Begins a scan of a sample, of the chosen one unless another is named; its job, or null.
+export async function scanIt(named: string = sample.value): Promise<string | null> {
   go.disabled = true;
   try {
-    const other = sample.value && sample.value !== store.state?.sample.name;
-    if (other && !(await command("sample.set", { name: sample.value }, "The sample stays"))) return false;
+    const other = named && named !== store.state?.sample.name;
+    if (other && !(await command("sample.set", { name: named }, "The sample stays"))) return null;
     const state = await call("state.get").catch(() => null);
     const made = state && (await script(state));
     const asked = made && { text: made.text, speed_up: "max" as const };
     const job = asked && (await command("script.submit", asked, "No scan"));
-    if (!job) return false;
+    if (!job) return null;
     mine = job.job;
     busy = true;
     watch();
-    emit("note", "good", "Scan it", `${sample.value || "the sample"}: ${job.job} has begun`);
-    return true;
+    emit("note", "good", "Scan it", `${named || "the sample"}: ${job.job} has begun`);
+    return job.job;
   } finally {
     go.disabled = false;
   }
@@ -106,7 +108,10 @@ on("job", (job) => {
   }
 });
 on("volume", (volume) => {
-  if (busy && mine === null && (volume.compared || volume.not_compared || volume.problem)) busy = false;
+  const ended = volume.compared || volume.not_compared || volume.problem;
+  if (mine === null && ended) busy = false;
 });
-clicks({ "scan-it": scanIt });
-sample.addEventListener("change", () => setText(note, `${sample.value} is put on the stage first.`));
+clicks({ "scan-it": () => scanIt() });
+sample.addEventListener("change", () => {
+  setText(note, `${sample.value} is put on the stage first.`);
+});

@@ -1,6 +1,7 @@
-// Misalign: the thesis as a story in five steps. The scanner is told a wrong geometry, a scan shows what that does to a
-// volume, the bead phantom tells the right one, and a second scan is sharp again. Images are the same with a part that
-// is displaced and with a reconstruction that believes it displaced: so nothing has to be bent.
+// Misalign: the thesis as a story in five steps. The scanner is told a wrong geometry, a
+// scan shows what that does to a volume, the bead phantom tells the right one, and a second
+// scan is sharp again. Images are the same with a part that is displaced and with a
+// reconstruction that believes it displaced: so nothing has to be bent.
 import { $, clicks, el, fixed, setText, words } from "./dom.js";
 import { call, command, emit, on, store } from "./link.js";
 import { apply } from "./calibrate.js";
@@ -9,24 +10,30 @@ import { scanIt } from "./scan_it.js";
 import type { JobStatus } from "./viewer.js";
 
 const PHANTOM = "lego";
-// What is estimated: the usual parameters, and the panel's roll. Beads hardly tell its tilt from their height.
+// What is estimated: the usual parameters, and the panel's roll. Beads hardly tell its tilt
+// from their height.
 const FREE = ["dO_x", "dO_y", "dO_z", "alpha", "tau_x", "tau_z", "det_roll"];
 const COMMENT = "misaligned by hand";
-// Offset -> what it is, its unit, the largest and the first value of its slider, what it does to a volume.
-const TRUTH: Record<string, [what: string, unit: string, most: number, first: number, does: string]> = {
+// Offset -> what it is, its unit, the largest and the first value of its slider, what it
+// does to a volume.
+type Offset = [what: string, unit: string, most: number, first: number, does: string];
+const TRUTH: Record<string, Offset> = {
   dO_x: ["axis aside", "mm", 1, 0.5, "edges double, balls become arcs"],
   det_roll: ["panel rolled", "°", 3, 1, "slices shear, worse away from the middle"],
   det_pitch: ["panel tilted", "°", 5, 0, "slices blur with their height"],
   dS_x: ["source aside", "mm", 1, 0, "edges double, as of the axis"],
 };
 const STEPS: Array<[id: string, button: string, says: string]> = [
-  ["story-bend", "1  Misalign", "Choose how wrong the geometry is; the bead phantom goes onto the stage."],
+  ["story-bend", "1  Misalign",
+    "Choose how wrong the geometry is; the bead phantom goes onto the stage."],
   ["story-scan", "2  Scan it", "One turn, reconstructed with the wrong geometry."],
   ["story-fit", "3  Calibrate", "The phantom's beads tell where axis, panel and source are."],
   ["story-apply", "4  Apply", "What was found comes into force."],
-  ["story-again", "5  Scan it again", "The same turn, the right geometry. Share it from the volume."],
+  ["story-again", "5  Scan it again",
+    "The same turn, the right geometry. Share it from the volume."],
 ];
 let step = 0;
+let job: string | null = null;
 let dataset: string | null = null;
 let found: Record<string, number> | null = null;
 let waiting = false;
@@ -38,18 +45,26 @@ const card = el("details", { class: "card", id: "story" },
   el("summary", {}, "Misalign: what a wrong geometry does, in five steps"),
   ...Object.entries(TRUTH).map(([name, [what, unit, most, start, does]]) =>
     el("div", { title: does },
-      el("label", { for: `story-${name}` }, `${what} `, el("output", { id: `story-${name}-is`, class: "mono" }), ` ${unit}`),
+      el("label", { for: `story-${name}` }, `${what} `,
+        el("output", { id: `story-${name}-is`, class: "mono" }), ` ${unit}`),
       el("input", {
         type: "range", id: `story-${name}`, min: -most, max: most, step: most / 50, value: start,
-        oninput: () => told(),
+        oninput: () => says(),
       }))),
-  ...STEPS.map(([id, button]) => el("button", { id, class: "small", disabled: id !== first }, button)),
+  ...STEPS.map(([id, button]) =>
+    el("button", { id, class: "small", disabled: id !== first }, button)),
   el("div", { id: "story-says", class: "small-text", "aria-live": "polite" }),
   el("div", { id: "story-found", class: "small-text mono" }));
 $("#tab-calibrate").prepend(card);
 
-function told(): void {
-  for (const name of Object.keys(TRUTH)) setText($(`#story-${name}-is`), fixed(slider(name).valueAsNumber, 2));
+function chosen(): Record<string, number> {
+  const names = Object.keys(TRUTH);
+  return Object.fromEntries(names.map((name) => [name, slider(name).valueAsNumber]));
+}
+function says(): void {
+  for (const [name, value] of Object.entries(chosen())) {
+    setText($(`#story-${name}-is`), fixed(value, 2));
+  }
 }
 function show(says = STEPS[step]?.[2] ?? ""): void {
   STEPS.forEach(([id], k) => {
@@ -64,7 +79,10 @@ function next(): void {
   step += 1;
   show(step < STEPS.length ? undefined : `Sharp again. ${compared()}`);
 }
-const compared = () => `Rms difference from the truth: ${rms.map((one) => `${fixed(one, 5)} /mm`).join(", then ")}.`;
+function compared(): string {
+  const values = rms.map((one) => `${fixed(one, 5)} /mm`).join(", then ");
+  return `Rms difference from the truth: ${values}.`;
+}
 function failed(why: string): void {
   waiting = false;
   show(why);
@@ -74,15 +92,17 @@ async function bend(): Promise<void> {
   step = 0;
   rms.length = 0;
   setText($("#story-found"), "");
-  const parameters = Object.fromEntries(Object.keys(TRUTH).map((name) => [name, slider(name).valueAsNumber]));
+  const wrong = { parameters: chosen(), source: null, comment: COMMENT };
   if (!(await command("sample.set", { name: PHANTOM }, "The sample stays"))) return;
-  if (!(await command("calibration.apply", { parameters, source: null, comment: COMMENT }, "Not applied"))) return;
+  if (!(await command("calibration.apply", wrong, "Not applied"))) return;
   next();
 }
 async function scan(): Promise<void> {
   waiting = true;
   show("Scanning; the volume grows in the scene.");
-  if (!(await scanIt())) failed("The scan did not begin.");
+  dataset = null;
+  job = await scanIt(PHANTOM);
+  if (!job) failed("The scan did not begin: the note says why.");
 }
 async function fit(): Promise<void> {
   if (!dataset) return;
@@ -100,7 +120,9 @@ async function fit(): Promise<void> {
   const { parameters } = report;
   const rows = Object.entries(TRUTH).map(([name, [what, unit]]) => {
     const one = parameters[name] as { value: number; sigma: number | null } | undefined;
-    const seen = one ? `found ${fixed(one.value, 3)} ± ${fixed(one.sigma, 3)} ${unit}` : "not estimated: back to nominal";
+    const seen = one
+      ? `found ${fixed(one.value, 3)} ± ${fixed(one.sigma, 3)} ${unit}`
+      : "not estimated: back to nominal";
     return el("div", {}, `${what}: told ${fixed(slider(name).valueAsNumber, 2)} ${unit}, ${seen}`);
   });
   $("#story-found").replaceChildren(...rows);
@@ -108,15 +130,16 @@ async function fit(): Promise<void> {
 }
 async function use(): Promise<void> {
   if (!found || !dataset) return;
-  await apply(found, dataset, "after a story");
-  next();
+  if (await apply(found, dataset, "after a story")) next();
 }
-on("job", (job: JobStatus) => {
-  if (!waiting || (step !== 1 && step !== 4)) return;
-  if (job.state === "done") {
-    dataset = folder(job);
+on("job", (told: JobStatus) => {
+  if (!waiting || told.job !== job) return;
+  if (told.state === "done") {
+    dataset = folder(told);
     show("Reconstructing, and comparing with the truth …");
-  } else if (["failed", "aborted", "incomplete"].includes(job.state)) failed(`The scan is ${job.state}.`);
+  } else if (["failed", "aborted", "incomplete"].includes(told.state)) {
+    failed(`The scan is ${told.state}.`);
+  }
 });
 on("volume", (volume) => {
   if (!waiting || !volume.past || volume.name !== dataset) return;
@@ -127,9 +150,17 @@ on("volume", (volume) => {
   next();
   if (step === 2) show(`${compared()} ${STEPS[2][2]}`);
 });
-on("connection", () => { if (!store.twin && waiting) failed("The connection was lost meanwhile."); });
-clicks({ "story-bend": bend, "story-scan": scan, "story-fit": fit, "story-apply": use, "story-again": scan });
-told();
+on("connection", () => {
+  if (!store.twin && waiting) failed("The connection was lost meanwhile.");
+});
+clicks({
+  "story-bend": bend,
+  "story-scan": scan,
+  "story-fit": fit,
+  "story-apply": use,
+  "story-again": scan,
+});
+says();
 show();
 export function open(): void {
   emit("show-tab", "calibrate");
