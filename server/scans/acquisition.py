@@ -31,9 +31,9 @@ Put = Callable[[str, npt.NDArray[np.uint16]], object]
 FrameListener = Callable[[Exposure, Radiograph], None]
 """Called with the last projection of each batch: the frame and its image."""
 
-REMEMBERED = 2
+MEMORY_FRAMES = 2
 """Number of earlier frames that a frame may depend on."""
-RECENT = 16
+KEPT_IMAGES = 16
 """Number of images kept for later frames."""
 
 
@@ -93,7 +93,7 @@ class Acquisition:
         if self.radiography.remembers:
             for frame, image in zip(batch, images, strict=True):
                 self._recent[frame.index] = image
-            while len(self._recent) > RECENT:
+            while len(self._recent) > KEPT_IMAGES:
                 del self._recent[next(iter(self._recent))]
         return images
 
@@ -106,7 +106,7 @@ class Acquisition:
         if not self.radiography.remembers:
             return ()
         found = []
-        for index in range(max(0, frame.index - REMEMBERED), frame.index):
+        for index in range(max(0, frame.index - MEMORY_FRAMES), frame.index):
             earlier = self.plan.exposures[index]
             gap = frame.start_s - earlier.start_s - earlier.duration_s
             if earlier.xrays_on and earlier.camera == frame.camera and gap < MAX_MEMORY_S:
@@ -141,7 +141,7 @@ class Acquisition:
                         self.radiography.panel, charge, lit, settings_of(now), max(gap, 0.0)
                     )
                 self._trapped[index + 1] = charge
-                self._trapped.pop(index + 1 - RECENT, None)
+                self._trapped.pop(index + 1 - KEPT_IMAGES, None)
             return charge
 
     async def _project(self, batch: Sequence[Exposure]) -> list[Radiograph]:

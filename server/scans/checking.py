@@ -43,7 +43,7 @@ from flexdt.twin.script import (
 from flexdt.twin.script.parse import LIGHT_BYTES, is_light
 from flexdt.twin.script.planning.plan_values import SampleSize
 
-AT_ONCE: Final = 2
+MAX_PARALLEL_CHECKS: Final = 2
 """Largest number of checks in worker processes at a time; others wait."""
 SECONDS: Final = float(CHECK_LIMITS["seconds"])
 MEMORY_BYTES: Final = int(CHECK_LIMITS["memory_bytes"])
@@ -54,7 +54,7 @@ STEP_BYTES: Final = 100
 """Least size of a step in a report without its texts [bytes]."""
 ANSWER_PIECE: Final = 1 << 18
 """Size of a report's portions [bytes]: 50 MB are never copied at once."""
-A_PIECE: Final = 250
+PARTS_A_PIECE: Final = 250
 """Number of parts of a plan that are unpickled at a time."""
 _T = TypeVar("_T")
 
@@ -148,10 +148,10 @@ class Checks:
 
     def __init__(self, apart: bool = True) -> None:
         self._apart = apart
-        self._workers = Workers(AT_ONCE, MEMORY_BYTES, SECONDS)
+        self._workers = Workers(MAX_PARALLEL_CHECKS, MEMORY_BYTES, SECONDS)
         self._last: Checked | None = None
         # Light checks of many clients take turns, so that a scan always finds a worker thread.
-        self._turn = asyncio.Semaphore(AT_ONCE)
+        self._turn = asyncio.Semaphore(MAX_PARALLEL_CHECKS)
 
     async def report(self, matter: CheckInput, codec: Codec) -> Sequence[bytes]:
         """Compute the dry-run report, encoded in portions.
@@ -311,9 +311,9 @@ def _pieces_of(plan: ScanPlan) -> list[bytes]:
     long = {name: parts for name, parts in rest.items() if isinstance(parts, tuple)} | axes | files
     short = {name: value for name, value in rest.items() if name not in long}
     pieces = [
-        (name, parts[at : at + A_PIECE])
+        (name, parts[at : at + PARTS_A_PIECE])
         for name, parts in long.items()
-        for at in range(0, max(len(parts), 1), A_PIECE)
+        for at in range(0, max(len(parts), 1), PARTS_A_PIECE)
     ]
     return [pickle.dumps(short), *map(pickle.dumps, pieces)]
 

@@ -33,7 +33,7 @@ from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script import Exposure, ScanPlan
 
 PUBLISH_INTERVAL_S = 0.1
-NAMED = 20
+MAX_NAMED_JOBS = 20
 """Number of the newest jobs that an error lists."""
 
 
@@ -103,7 +103,7 @@ class Jobs:
             return next(reversed(self._all.values()))
         if job is None or job not in self._all:
             asked = "" if job is None else f"no job {job!r}; "
-            last = list(self._all)[-NAMED:]
+            last = list(self._all)[-MAX_NAMED_JOBS:]
             older = len(self._all) - len(last)
             more = f"{older} older ones and " if older else ""
             there = f"there are: {more}{', '.join(last)}" if last else "there are no jobs yet"

@@ -26,7 +26,7 @@ from flexdt.twin.script import commands as c
 
 BATCH = 4
 WORKERS = 2
-CHECKS = 3
+MAX_SWEEPS = 3
 """Sweeps of the rest of a plan before a run gives up because others move the scanner."""
 ROOM = 16
 Produce = Callable[[Sequence[Exposure]], Awaitable[None]]
@@ -372,7 +372,7 @@ class ScanRunner:
         """
         paces = {axis: pace[1] for axis, pace in self.scanner.paces.items()}
         way = rejoin(self.plan, tau, paces)
-        for _ in range(CHECKS):
+        for _ in range(MAX_SWEEPS):
             # The stage may change and motors may be moved while all of it is swept in a thread.
             programme = await asyncio.to_thread(way.programme)
             prepared = self.scanner.prepared(programme, self.clock.now(), way.start)

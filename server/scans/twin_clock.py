@@ -29,7 +29,7 @@ SAMPLE_S = 0.25
 LATE_S = 1e9
 """Time from which on (31 years) time runs no faster than real time [s]: its steps are
 0.1 us then, and motion is swept with an allowance for such steps."""
-PATIENCE = 3
+WAKE_ROUNDS = 3
 """Rounds of the event loop for the tasks just woken, before time jumps again."""
 
 
@@ -166,7 +166,7 @@ class TwinClock:
             return
         loop = asyncio.get_running_loop()
         if self._speed_up == "max":
-            self._timer = loop.call_soon(self._jump, PATIENCE)
+            self._timer = loop.call_soon(self._jump, WAKE_ROUNDS)
         else:
             now = self._time()
             pace = self._speed_up if now < LATE_S else min(1.0, self._speed_up)

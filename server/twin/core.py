@@ -59,7 +59,7 @@ from flexdt.twin.script import Exposure
 
 LOG_KEPT = 50
 """Number of entries of the topic `log` that a late subscriber gets."""
-FAILURES, FAILURES_S = 5, 60.0
+MAX_FAILURES, FAILURE_WINDOW_S = 5, 60.0
 """Number of failures, within a time [real s], after which a service is not restarted."""
 SERVICE_PAUSE_S = 0.1
 
@@ -359,7 +359,7 @@ class TwinServer:
         A service that fails repeatedly ends the process, which its supervisor restarts:
         without the service the server would answer without acting.
         """
-        ends: deque[float] = deque(maxlen=FAILURES)
+        ends: deque[float] = deque(maxlen=MAX_FAILURES)
         while not self.failed.is_set():
             try:
                 await work()
@@ -367,7 +367,7 @@ class TwinServer:
             except Exception:
                 log("a service of the twin failed", logging.CRITICAL, error=True)
                 ends.append(asyncio.get_running_loop().time())
-                if len(ends) == FAILURES and ends[-1] - ends[0] < FAILURES_S:
+                if len(ends) == MAX_FAILURES and ends[-1] - ends[0] < FAILURE_WINDOW_S:
                     self.failed.set()
                 await asyncio.sleep(SERVICE_PAUSE_S)
 

@@ -22,7 +22,7 @@ from flexdt.protocol.fields import TopicName
 from flexdt.protocol.rpc_errors import busy
 from flexdt.server.network.shell_parts import Peer
 
-A_TURN = 4
+EVENTS_A_TURN = 4
 """Events posted in one turn of the event loop; requests are handled between turns."""
 
 
@@ -93,7 +93,7 @@ class Hub:
         self._seq: dict[TopicName, int] = {}
         self._listeners: dict[TopicName, dict[Peer, _Subscription]] = {}
         self._due: deque[tuple[Peer, _Subscription, _Event]] = deque()
-        self._room = A_TURN
+        self._room = EVENTS_A_TURN
         self._refilling = False
 
     def subscribe(
@@ -244,6 +244,6 @@ class Hub:
             asyncio.get_running_loop().call_soon(self._refill)
 
     def _refill(self) -> None:
-        self._room, self._refilling = A_TURN, False
+        self._room, self._refilling = EVENTS_A_TURN, False
         if self._due:
             self._drain()

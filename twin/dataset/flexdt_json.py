@@ -37,7 +37,7 @@ from flexdt.twin.script import SampleSize, ScanPlan
 from flexdt.twin.script.planning.plan import saved_images
 from flexdt.twin.values import ArrayValue, message_of
 
-SAME = 1e-4
+POSITION_TOLERANCE = 1e-4
 """Largest difference of positions that count as one [mm, deg]: texts have six
 decimals."""
 
@@ -271,13 +271,13 @@ class ScanRecord(ArrayValue):
         }
         angles = self.angles_deg()
         rule = np.linspace(angles[0], angles[-1], len(angles))
-        if np.abs(angles - rule).max() < SAME and all(
-            np.abs(v - self.positions[n]).max() < SAME for n, v in still.items()
+        if np.abs(angles - rule).max() < POSITION_TOLERANCE and all(
+            np.abs(v - self.positions[n]).max() < POSITION_TOLERANCE for n, v in still.items()
         ):
             return 1
         steps = np.zeros(len(angles) - 1, dtype=bool)
         for values in still.values():
-            steps |= np.abs(np.diff(values)) > SAME
+            steps |= np.abs(np.diff(values)) > POSITION_TOLERANCE
         return max(2, 1 + int(np.count_nonzero(steps)))
 
     def settings_pose(self) -> Poses:

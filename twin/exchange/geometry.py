@@ -20,7 +20,7 @@ from flexdt.twin.geometry.poses import Poses
 
 SAME_MM: Final = 1e-9
 """Largest error of a geometry in an exchange format [mm]."""
-SQUARE: Final = 1e-9
+SQUARE_TOLERANCE: Final = 1e-9
 """Largest cosine of u and v, and relative difference of pitches, that count as zero."""
 
 
@@ -148,9 +148,9 @@ def require_panel(cone_vec: ConeVec, format_name: str) -> tuple[float, float]:
     lengths = np.stack([np.linalg.norm(u, axis=1), np.linalg.norm(v, axis=1)], axis=1)
     cosine = np.abs(np.einsum("ni,ni->n", u, v)) / (lengths[:, 0] * lengths[:, 1])
     what = f"{format_name} knows panels with orthogonal rows and columns; their cosine"
-    require_each(what, cosine, SQUARE)
+    require_each(what, cosine, SQUARE_TOLERANCE)
     change = np.abs(lengths / lengths[0] - 1.0).max(axis=1)
-    require_each(f"{format_name} knows one pixel size; its change", change, SQUARE)
+    require_each(f"{format_name} knows one pixel size; its change", change, SQUARE_TOLERANCE)
     return float(lengths[:, 0].mean()), float(lengths[:, 1].mean())
 
 

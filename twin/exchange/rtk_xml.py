@@ -23,7 +23,7 @@ from flexdt.twin.plausibility.scan_geometry import distance_findings
 
 TO_RTK: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """Matrix from our (x, y, z) to RTK's; a rotation, no mirror."""
-SAME: Final = 1e-9
+ROUNDING_TOLERANCE: Final = 1e-9
 """Largest relative difference of distances that counts as rounding."""
 VERSION: Final = "3"
 NAMES: Final = ("GantryAngle", "OutOfPlaneAngle", "InPlaneAngle", "SourceToIsocenterDistance",
@@ -150,7 +150,7 @@ def _require_distances(stated: list[tuple[float, float]], file: str) -> None:
         return
     pairs = np.array(stated)
     sod, sdd = (pairs * np.sign(pairs[:, 1:])).T
-    if ((sod <= 0.0) | (sod > sdd * (1 + SAME))).all():
+    if ((sod <= 0.0) | (sod > sdd * (1 + ROUNDING_TOLERANCE))).all():
         names = ("SourceToIsocenterDistance", "SourceToDetectorDistance")
         impossible = distance_findings(float(sod[0]), float(sdd[0]), 0.1 * sdd[0], names)
         settled(impossible, ExchangeError, file)

@@ -32,10 +32,10 @@ from flexdt.twin.exchange.view_arrays import (
 )
 from flexdt.twin.geometry.conventions import FloatArray, rotation_z
 
-STILL: Final = 1e-11
+CONSTANT_TOLERANCE: Final = 1e-11
 """Largest change of an attribute between views [mm, rad] that is written once: a
 hundredth of an exchange format's largest error."""
-UPRIGHT: Final = 1e-6
+MIN_LEVEL_PART: Final = 1e-6
 """Least horizontal part of the panel's normal from which its angle is computed."""
 PER_VIEW: Final = {"DSO": 0, "DSD": 0, "offOrigin": 3, "offDetector": 2, "rotDetector": 3}
 """Attributes with a value a view -> length of a value; 0: a number. Lengths [mm],
@@ -61,7 +61,7 @@ def tigre_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
     normal = right_handed * np.sign(np.einsum("ni,ni->n", right_handed, apart))[:, None]
     level = np.hypot(normal[:, 0], normal[:, 1])
     what = "TIGRE knows panels that do not lie flat; the sine of their normal to the xy plane"
-    require_each(what, np.sqrt(np.maximum(1.0 - level**2, 0.0)), 1.0 - UPRIGHT)
+    require_each(what, np.sqrt(np.maximum(1.0 - level**2, 0.0)), 1.0 - MIN_LEVEL_PART)
     angles = np.unwrap(np.arctan2(normal[:, 1], normal[:, 0]))
     back = rotation_z(-angles)
     source, apart, u, v = (np.einsum("nij,nj->ni", back, p) for p in (c.source, apart, u, v))
@@ -85,7 +85,7 @@ def tigre_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
 
 def _once(values: FloatArray) -> FloatArray:
     """Return one value if all views have the same, else the value of each view."""
-    still = np.ptp(values, axis=0).max() <= STILL
+    still = np.ptp(values, axis=0).max() <= CONSTANT_TOLERANCE
     one: FloatArray = values[:1] if values.ndim == 1 else values[0]
     return np.ascontiguousarray(one if still else values) + 0.0
 
@@ -105,7 +105,9 @@ def _turns(axes: FloatArray) -> FloatArray:
     nearer = np.abs(whole[:, :, [0, 2]]).sum(axis=2).argmin(axis=0)
     found: FloatArray = whole[nearer, np.arange(len(axes))]
     # Half a turn either way is one pose; all views of a scan have the same sign.
-    return np.where(np.isclose(found, -np.pi, rtol=0.0, atol=STILL), found + 2.0 * np.pi, found)
+    return np.where(
+        np.isclose(found, -np.pi, rtol=0.0, atol=CONSTANT_TOLERANCE), found + 2.0 * np.pi, found
+    )
 
 
 def read_tigre(arrays: Arrays, file: str = "<npz>") -> ScanGeometry:

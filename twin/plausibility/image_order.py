@@ -19,12 +19,12 @@ from flexdt.twin.plausibility.findings import Finding, Severity
 NUMBER: Final = re.compile(r"(?P<sign>[-+]?)(?P<whole>\d+)(?P<part>\.\d+)?")
 SIGNED_AFTER: Final = frozenset("_ =(,")
 """Characters, or the name's beginning, after which a hyphen is a minus sign."""
-MOST_OTHERS: Final = 0.1
+MAX_OTHERS_SHARE: Final = 0.1
 """Largest share of names (or two names) that may differ in form from the rest by
 mistake."""
-EVEN: Final = 0.8
+MIN_EVEN_SHARE: Final = 0.8
 """Least share of equal steps between numbers for which a missing number is a gap."""
-TOLD: Final = 3
+MAX_NAMES_SHOWN: Final = 3
 """Number of names in a message."""
 Key = tuple[str | float, ...]
 """Texts and numbers of a name in turn, beginning with a text."""
@@ -90,7 +90,7 @@ def _numbered(names: list[str]) -> Ordered | None:
 def other_name(others: Sequence[str], names: Sequence[str]) -> Finding:
     """Tell of names that are written otherwise than those of the other images."""
     like = next(name for name in names if name not in others)
-    told = ", ".join(others[:TOLD])
+    told = ", ".join(others[:MAX_NAMES_SHOWN])
     cause = f"{told} {_is(others)} named otherwise than the rest, such as {like}"
     remedy = "frames=PATTERN says which are projections"
     return Finding("other name", cause, remedy, Severity.WARNING, float(len(others)))
@@ -163,7 +163,7 @@ def _written_otherwise(names: Sequence[str], keys: dict[str, Key]) -> tuple[str,
     texts = Counter(_text(keys[name]) for name in names)
     usual, most = texts.most_common(1)[0] if texts else ("", 0)
     few = [name for name in names if _text(keys[name]) != usual]
-    if most < 4 or not 0 < len(few) <= max(2.0, MOST_OTHERS * len(names)):
+    if most < 4 or not 0 < len(few) <= max(2.0, MAX_OTHERS_SHARE * len(names)):
         return ()
     return tuple(few)
 
@@ -190,7 +190,11 @@ def _gaps(names: Sequence[str], keys: dict[str, Key]) -> Iterator[Finding]:
     usual = float(np.median(steps))
     wide = np.flatnonzero(steps > 1.5 * usual)
     alike = np.abs(steps / usual - np.round(steps / usual)) < 1e-3 if usual > 0 else steps < 0
-    if len(wide) and alike.all() and (np.abs(steps - usual) < 0.01 * usual).mean() >= EVEN:
+    if (
+        len(wide)
+        and alike.all()
+        and (np.abs(steps - usual) < 0.01 * usual).mean() >= MIN_EVEN_SHARE
+    ):
         at = int(wide[0])
         lost = int(np.sum(np.round(steps[wide] / usual) - 1))
         cause = (

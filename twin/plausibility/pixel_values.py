@@ -14,17 +14,17 @@ EDGE_PART: Final = 0.06
 """Share of an image's columns, or rows, that count as its edges."""
 OPEN: Final = (0.95, 1.05)
 """Range of transmission of the open beam."""
-SAME_BEAM: Final = 0.05
+MIN_BEAM_SHARE: Final = 0.05
 """Least share of pixels that show the open beam."""
-DARKER: Final = 0.85
+MAX_OBJECT_TRANSMISSION: Final = 0.85
 """Largest transmission behind an object, relative to the open beam."""
-MOST_BRIGHT: Final = 0.02
+MAX_BRIGHT_SHARE: Final = 0.02
 """Largest share of pixels that noise makes a fifth brighter than the open beam."""
-COUNTED: Final = 25.0
+MAX_LINE_INTEGRAL: Final = 25.0
 """Line integral above which no photon passes: fewer than 1e-10."""
-MOST_PER_MM: Final = 200.0
+MAX_PER_MM: Final = 200.0
 """Largest attenuation of any element at energies of tubes [1/mm]."""
-LEAST_HOUNSFIELD: Final = -200.0
+MIN_ATTENUATION: Final = -200.0
 """Value below which a volume is in Hounsfield units: artefacts never bring attenuation
 so low."""
 
@@ -38,7 +38,7 @@ def integral_findings(images: npt.NDArray[Any]) -> Iterator[Finding]:
     values = np.asarray(images)
     if not values.size:
         return
-    if values.dtype.kind in "ui" and int(values.max()) > COUNTED:
+    if values.dtype.kind in "ui" and int(values.max()) > MAX_LINE_INTEGRAL:
         cause = f"line integrals of {values.dtype} up to {values.max()}, as counts have"
         yield Finding("counts", cause, _FROM_COUNTS, Severity.REFUSAL, float(values.max()))
         return
@@ -50,14 +50,14 @@ def integral_findings(images: npt.NDArray[Any]) -> Iterator[Finding]:
     beam = _beam(values)
     if beam is None:
         return
-    darker = float((values < DARKER * beam).mean())
+    darker = float((values < MAX_OBJECT_TRANSMISSION * beam).mean())
     brighter = float((values > 1.2 * beam).mean())
-    if beam > COUNTED and brighter < MOST_BRIGHT:
+    if beam > MAX_LINE_INTEGRAL and brighter < MAX_BRIGHT_SHARE:
         cause = f"line integrals of {beam:.4g} at the images' edges, less behind the object"
         yield Finding("counts", cause, _FROM_COUNTS, Severity.REFUSAL, beam)
-    elif OPEN[0] < beam < OPEN[1] and darker > 1e-3 and brighter < MOST_BRIGHT:
+    elif OPEN[0] < beam < OPEN[1] and darker > 1e-3 and brighter < MAX_BRIGHT_SHARE:
         open_share = float(((values > OPEN[0] * beam) & (values < OPEN[1] * beam)).mean())
-        if open_share > SAME_BEAM and float(np.quantile(values, 1e-3)) > -0.1:
+        if open_share > MIN_BEAM_SHARE and float(np.quantile(values, 1e-3)) > -0.1:
             cause = (
                 f"values are {beam:.3g} at the images' edges and less behind the object, as "
                 "transmission is"
@@ -104,11 +104,11 @@ def volume_findings(values: npt.NDArray[Any]) -> Iterator[Finding]:
         high = float(np.nanmax(np.where(bad, np.nan, data))) if not bad.all() else 0.0
     else:
         low, high = float(data.min()), float(data.max())
-    if low < LEAST_HOUNSFIELD:
+    if low < MIN_ATTENUATION:
         cause = f"attenuation from {low:.5g} to {high:.5g} /mm, as Hounsfield units are"
         remedy = "attenuation is mu_water * (1 + HU / 1000), some 0.02 /mm of water"
         yield Finding("Hounsfield", cause, remedy, Severity.REFUSAL, low)
-    elif high > MOST_PER_MM:
+    elif high > MAX_PER_MM:
         cause = f"attenuation of up to {high:.5g} /mm, more than any element has"
         remedy = "grey values need a scale to 1/mm, labels material={1: NAME}"
         yield Finding("Hounsfield", cause, remedy, Severity.WARNING, high)

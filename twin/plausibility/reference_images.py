@@ -11,20 +11,20 @@ import numpy.typing as npt
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.plausibility.findings import Finding, Severity
 
-MOST_APART: Final = 0.015
+MAX_FLAT_DIFFERENCE: Final = 0.015
 """Largest relative difference of flat images' levels by a tube's own variation."""
-MOST_DRIFT: Final = 0.03
+MAX_BEAM_DIFFERENCE: Final = 0.03
 """Largest relative difference of open beam and flat image by scatter or a tube's
 drift."""
-SIGMAS: Final = 6.0
+NOISE_SIGMAS: Final = 6.0
 """Differences below this many standard deviations count as noise."""
 STRIP_PART: Final = 0.03
 """Width of a strip at an image's edge, as a share of its columns."""
-LEVEL: Final = 0.004
+MAX_STRIP_DIFFERENCE: Final = 0.004
 """Largest relative difference of neighbouring strips in the open beam."""
-BLOCKS: Final = 4
+STRIP_BLOCKS: Final = 4
 """Parts of a strip that are compared with each other."""
-SEEN: Final = 0.8
+MIN_OPEN_VIEWS_SHARE: Final = 0.8
 """Least share of the views that must see the open beam on both sides."""
 
 
@@ -47,7 +47,7 @@ def flat_findings(flats: npt.NDArray[Any], dark: npt.NDArray[Any]) -> Iterator[F
     spread = np.median(np.abs(ratio - level[:, None]), axis=1)
     noise = float((1.4826 * 1.2533 * spread).max() / np.sqrt(ratio.shape[1]))
     apart = float(np.ptp(level))
-    if apart > max(MOST_APART, SIGMAS * noise):
+    if apart > max(MAX_FLAT_DIFFERENCE, NOISE_SIGMAS * noise):
         cause = (
             f"the flat images differ by {100 * apart:.3g} %: level {level.min():.3g} to "
             f"{level.max():.3g} of their mean"
@@ -63,11 +63,11 @@ def beam_findings(levels_seen: Sequence[float | None]) -> Iterator[Finding]:
         levels_seen: of the open beam in some views (`open_beam`), relative to the flat image.
     """
     found = [level for level in levels_seen if level is not None]
-    if len(found) < max(2.0, SEEN * len(levels_seen)):
+    if len(found) < max(2.0, MIN_OPEN_VIEWS_SHARE * len(levels_seen)):
         return
     levels = np.array(found)
     high, apart = float(levels.max()), float(np.ptp(levels))
-    if high <= 1.0 + MOST_DRIFT and not (apart > MOST_DRIFT and _drifts(levels)):
+    if high <= 1.0 + MAX_BEAM_DIFFERENCE and not (apart > MAX_BEAM_DIFFERENCE and _drifts(levels)):
         return  # an object that reaches beyond both edges is as dark
     span = " to ".join(dict.fromkeys(f"{level:.3g}" for level in (levels.min(), high)))
     cause = f"the open beam beside the object is {span} times the flat image"
@@ -97,7 +97,7 @@ def open_beam(
     """
     rows, cols = counts.shape
     wide = max(1, int(STRIP_PART * cols))
-    if cols < 8 * wide or rows < 2 * BLOCKS:
+    if cols < 8 * wide or rows < 2 * STRIP_BLOCKS:
         return None
     levels = []
     for some in (slice(2 * wide), slice(-1, -2 * wide - 1, -1)):
@@ -108,16 +108,24 @@ def open_beam(
             return None
         spread = float(np.nanstd(turned[:, : 2 * wide]))
         sigma = spread / np.sqrt(rows * wide)
-        if abs(float(outer.mean() - inner.mean())) > max(LEVEL, SIGMAS * sigma):
+        if abs(float(outer.mean() - inner.mean())) > max(
+            MAX_STRIP_DIFFERENCE, NOISE_SIGMAS * sigma
+        ):
             return None
-        if float(np.ptp(both)) > max(2.5 * LEVEL, SIGMAS * sigma * np.sqrt(2 * BLOCKS)):
+        if float(np.ptp(both)) > max(
+            2.5 * MAX_STRIP_DIFFERENCE, NOISE_SIGMAS * sigma * np.sqrt(2 * STRIP_BLOCKS)
+        ):
             return None
         levels.append(float(both.mean()))
     left, right = levels
-    return 0.5 * (left + right) if abs(left - right) <= 2.5 * LEVEL * max(left, right) else None
+    return (
+        0.5 * (left + right)
+        if abs(left - right) <= 2.5 * MAX_STRIP_DIFFERENCE * max(left, right)
+        else None
+    )
 
 
 def _blocks(strip: npt.NDArray[Any]) -> FloatArray:
     """Average the parts of a strip, from top to bottom."""
-    parts = [part[np.isfinite(part)] for part in np.array_split(strip, BLOCKS)]
+    parts = [part[np.isfinite(part)] for part in np.array_split(strip, STRIP_BLOCKS)]
     return np.array([float(part.mean()) if part.size else np.nan for part in parts])

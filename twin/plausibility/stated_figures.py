@@ -15,11 +15,11 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.plausibility.findings import Finding, Severity
 from flexdt.twin.plausibility.scan_geometry import about_z, azimuths
 
-SAME_ANGLE_DEG: Final = 0.1
+ANGLE_TOLERANCE_DEG: Final = 0.1
 """Largest difference of angles by encoders [deg]."""
-STEP_PART: Final = 0.2
+ANGLE_TOLERANCE_STEPS: Final = 0.2
 """The same as a share of the step between views; the larger of both counts."""
-SAME_PIXEL: Final = 0.02
+PIXEL_TOLERANCE: Final = 0.02
 """Largest relative difference of pixel sizes, some of which have two digits."""
 
 
@@ -38,7 +38,7 @@ def angle_findings(geometry: ConeVec, stated_rad: npt.ArrayLike) -> Iterator[Fin
     own = np.asarray(azimuths(geometry))
     off = _worst(own, stated)
     step = float(np.median(np.abs(_wrapped(np.diff(own)))))
-    allowed = max(math.radians(SAME_ANGLE_DEG), STEP_PART * step)
+    allowed = max(math.radians(ANGLE_TOLERANCE_DEG), ANGLE_TOLERANCE_STEPS * step)
     if off <= allowed:
         return
     figure = math.degrees(off)
@@ -73,7 +73,7 @@ def pixel_findings(geometry: ConeVec, stated_mm: float) -> Iterator[Finding]:
     beam = geometry.detector[0] - geometry.source[0]
     part = float(-geometry.source[0] @ beam / (beam @ beam))
     ratios = [stated_mm / pitch, stated_mm / (pitch * part) if part > 0.0 else math.inf]
-    if min(abs(ratio - 1.0) for ratio in ratios) <= SAME_PIXEL:
+    if min(abs(ratio - 1.0) for ratio in ratios) <= PIXEL_TOLERANCE:
         return
     cause = f"the file's pixel is {stated_mm:.4g} mm, the geometry's {pitch:.4g} mm"
     remedy = "is it the geometry of this scan, binned as its images are, and in mm?"

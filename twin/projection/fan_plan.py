@@ -35,17 +35,17 @@ WIDEST = 4.0
 """Widest fan [columns]."""
 FACING = 0.25
 """Least cosine between any ray and the view's horizontal direction for the view to have fans."""
-APART = 0.25
+MIN_GAP_SHARE = 0.25
 """Least distance of two fan boundaries in any row, as a share of that in the middle
 row."""
-MOST = 64
+MAX_FANS_A_PIXEL_LINE = 64
 """Largest number of fans of a view, per row and column of the detector."""
 EXCHANGED = [0, 1, 2, 3, 4, 5, 9, 10, 11, 6, 7, 8]
 """Order of a view's numbers (source, first pixel minus source, u, v) with u and v
 exchanged."""
 LEVEL = 1e-12
 """Largest distance in x and y of the ends of a detector column parallel to z [voxels]."""
-WIDE = 8.0
+MIN_UNIT_WIDTH = 8.0
 """Least width of a unit where it enters the volume [voxels]. A fan reaches at most two
 voxel columns beyond its own lines, and so does its second neighbour."""
 
@@ -181,9 +181,9 @@ def _tilted(
         pole = -_cross(u, first) / _cross(u, v)
         apart = (np.array([[0], [rows - 1]]) - pole) / ((rows - 1) / 2 - pole)
         good = np.isfinite(meeting).all(axis=1) & (np.abs(slope) <= 1)
-        good &= ~(apart < APART).any(axis=0)
+        good &= ~(apart < MIN_GAP_SHARE).any(axis=0)
         begin, end = meeting.min(axis=1) - 0.5, meeting.max(axis=1) + 0.5
-        good &= (end - begin) / step < MOST * (rows + cols)
+        good &= (end - begin) / step < MAX_FANS_A_PIXEL_LINE * (rows + cols)
     use = np.flatnonzero(good)
     begin, end, along, first, u, v = begin[use], end[use], along[use], first[use], u[use], v[use]
     fans = np.maximum(np.ceil((end - begin) / step[use]), 1).astype(np.int64)
@@ -305,13 +305,13 @@ def plan_turns(
 
 
 def _cuts(width: FloatArray) -> list[int]:
-    """List ends of runs of jobs that are at least WIDE wide; a remainder joins the last
+    """List ends of runs of jobs that are at least MIN_UNIT_WIDTH wide; a remainder joins the last
     run.
     """
     cuts, gathered = [0], 0.0
     for i, w in enumerate(width.tolist()):
         gathered += w
-        if gathered >= WIDE:
+        if gathered >= MIN_UNIT_WIDTH:
             cuts.append(i + 1)
             gathered = 0.0
     if len(cuts) == 1:

@@ -44,7 +44,7 @@ SIDE = 2**14
 """Largest number of voxels along an axis for the slab walk. In longer boxes single
 precision does not locate the ends of a ray in the box within the margin of the slab
 walk."""
-NEAR = 1e-9
+MIN_CLEARANCE = 1e-9
 """Least distance of a box from source and detector plane, as a share of their
 distance."""
 KINDS = 3
@@ -411,7 +411,7 @@ def clear_of(box: Box, views: FloatArray, shape: tuple[int, int]) -> npt.NDArray
     turned = depth < 0.0
     low, high = np.where(turned, -farthest, nearest), np.where(turned, -nearest, farthest)
     depth = np.abs(depth)
-    return np.asarray((low > NEAR * depth) & (high < (1.0 - NEAR) * depth))
+    return np.asarray((low > MIN_CLEARANCE * depth) & (high < (1.0 - MIN_CLEARANCE) * depth))
 
 
 def _corners(views: FloatArray, shape: tuple[int, int]) -> FloatArray:

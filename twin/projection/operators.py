@@ -63,16 +63,16 @@ ORDERS: tuple[Order, Order, Order] = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
 NO_FANS = 3
 """Code of single rays, after the indices into ORDERS: fans would hold too few rays to
 pay."""
-CROSSING, LEVEL, SLAB = (10.5, 15.5), (0.1, 1.0), 35.0
+FAN_CROSSING_NS, FAN_LEVEL_NS, FAN_SLAB_NS = (10.5, 15.5), (0.1, 1.0), 35.0
 """Time of a ray of a fan at a level, of a fan in a slab at each level, and of a fan in
 a slab apart from its levels [ns]. Pairs: fans of rays in one plane, and others."""
-ALONE, VIEW = 2.75, 5e5
+RAY_VOXEL_NS, PLAN_VIEW_NS = 2.75, 5e5
 """Time of a single ray at a voxel, and of planning the fans of a view [ns]. All of
 these were fitted to drawn geometries, each timed all four ways
 (`tests/studies/walks.py`), on two busy cores; only their ratios count."""
-PREFERRED = 0.75
+MAX_TIME_SHARE = 0.75
 """Largest share of the time that another axis may take to be worth another layout."""
-ON_ALL_CORES = 16 * 2**20
+MIN_PARALLEL_BYTES = 16 * 2**20
 """Size of projections from which on all cores check them together [bytes]."""
 Shape2 = tuple[int, int]
 
@@ -123,7 +123,7 @@ def level_axes(
     every = rows * cols * size.mean(axis=1)
     through = (np.array(counts[::-1]) / np.maximum(size[:, 4], 1e-9)).min(axis=1)
     times = np.empty((len(rays), 4))
-    times[:, NO_FANS] = through * ALONE * every.sum(axis=1)
+    times[:, NO_FANS] = through * RAY_VOXEL_NS * every.sum(axis=1)
     for i, (a, b, w) in enumerate(ORDERS):
 
         def across(step: FloatArray, a: int = a, b: int = b) -> FloatArray:
@@ -138,13 +138,13 @@ def level_axes(
         wide = across(columns) * far / np.maximum(np.hypot(middle[:, a], middle[:, b]), 1e-9) ** 2
         fans = steps * np.where(flat, 1.0, np.maximum(wide / SPREAD, 1.0 / WIDEST))
         levels = np.minimum(counts[2 - w], np.abs(along[:, w]) * length)
-        slab = SLAB + np.where(flat, *LEVEL) * levels
-        crossings = np.where(flat, *CROSSING) * every[:, w]
+        slab = FAN_SLAB_NS + np.where(flat, *FAN_LEVEL_NS) * levels
+        crossings = np.where(flat, *FAN_CROSSING_NS) * every[:, w]
         slabs = np.maximum(size[:, :, a], size[:, :, b]).mean(axis=1)
         facing = (np.hypot(size[:, :, a], size[:, :, b]) >= FACING).all(axis=1)
-        fanned = VIEW + through * (crossings + fans * slab * slabs)
+        fanned = PLAN_VIEW_NS + through * (crossings + fans * slab * slabs)
         times[:, i] = np.where(facing, fanned, np.inf)
-    times[:, 1:NO_FANS] /= PREFERRED
+    times[:, 1:NO_FANS] /= MAX_TIME_SHARE
     return np.asarray(np.argmin(times, axis=1))
 
 
@@ -407,7 +407,11 @@ def voxel_rays(cone_vec: ConeVec, layout: Layout, shape: Shape2) -> FloatArray:
 
 def _are_finite(values: npt.NDArray[Any]) -> bool:
     """Return whether all numbers are finite; many numbers are checked on all cores."""
-    if values.nbytes < ON_ALL_CORES or values.dtype != np.float32 or not values.flags.c_contiguous:
+    if (
+        values.nbytes < MIN_PARALLEL_BYTES
+        or values.dtype != np.float32
+        or not values.flags.c_contiguous
+    ):
         return math.isfinite(float(values.sum()))
     from flexdt.twin.projection.kernels import layout_kernels
 
@@ -446,7 +450,7 @@ def check_out(out: Float32Array | None, shape: tuple[int, int, int]) -> Float32A
     return out
 
 
-JUMPS = 4.0
+DERIVATIVE_COST = 4.0
 """Time of a ray whose derivatives are computed, as a multiple of that of its integral."""
 
 
@@ -496,7 +500,7 @@ def geometry_gradient(
     if not layout.empty and n:
         views = voxel_rays(geometry, layout, (rows, cols))
         box = box_of(layout)
-        job_ns = JUMPS * cpu.tile_ns(box, rows)
+        job_ns = DERIVATIVE_COST * cpu.tile_ns(box, rows)
         for first, last in equal_portions(len(parts), job_ns, cpu.threads()):
             siddon_kernels.gather(box, views, values, TILE, parts, first, last)
     return relaxed_gradient(parts.reshape(n, tiles, 12).sum(axis=1), times)
@@ -551,7 +555,7 @@ def geometry_change(
         each = np.broadcast_to(moved, (len(geometry), 12))
         steps = np.ascontiguousarray(stretched_steps(each, times))
         box, jobs = box_of(layout), len(geometry) * -(-shape[1] // TILE)
-        job_ns = JUMPS * cpu.tile_ns(box, shape[0])
+        job_ns = DERIVATIVE_COST * cpu.tile_ns(box, shape[0])
         for first, last in equal_portions(jobs, job_ns, cpu.threads()):
             siddon_kernels.follow(box, views, steps, TILE, result, first, last)
     return result

@@ -25,7 +25,7 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray, as_number
 from flexdt.twin.projection.portions import PASS_NS, equal_portions
 from flexdt.twin.signatures import File, public
 
-WARNED: Final = 0.03
+WARNING_BOUND: Final = 0.03
 """Relative bound from which on `Accuracy.warnings` warns if a tenth of the uniform
 regions exceed it. The bound is two to four times the actual deviation: about 1 %."""
 CAUSES: Final = {
@@ -84,7 +84,7 @@ class Accuracy:
         """A warning if a tenth of the regions may deviate by more than some per cent,
         else empty.
         """
-        return [f"values may be off; {self}"] * (self.most > WARNED)
+        return [f"values may be off; {self}"] * (self.most > WARNING_BOUND)
 
 
 @dataclass(frozen=True, eq=False)

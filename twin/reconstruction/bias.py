@@ -31,12 +31,12 @@ from flexdt.twin.reconstruction.coarse_scan import CoarseScan
 from flexdt.twin.reconstruction.consistency.agreement import Contradiction, contradiction_of
 from flexdt.twin.reconstruction.volume_errors import interpolated
 
-SAFETY: Final = 3.0
+SAFETY_FACTOR: Final = 3.0
 """Factor of the bound: the smooth coarse volume shows a third of what flaws take away."""
-TRUSTED: Final = 0.15
+PRISM_ERROR_SHARE: Final = 0.15
 """Share of a prism's part beyond the edges that may be wrong if it explains the
 images."""
-FLOOR: Final = 0.003
+FDK_ERROR_SHARE: Final = 0.003
 """Error of FDK without flaws, relative to the attenuation about a voxel."""
 USUAL_SHARE: Final = {
     "angles": 0.3, "aside": 0.1, "cone": 0.7, "rows": 1.0, "beyond": 1.0, "drift": 1.3,
@@ -46,10 +46,10 @@ that reach their bound in narrow places have small ones
 (`tests/studies/accuracy_rank.py`, seeds 61 and 62)."""
 USUAL_FLOOR: Final = 0.001
 """Usual error of FDK without flaws, relative to the attenuation."""
-SMOOTH: Final = 1.5
+SMOOTHING_NODES: Final = 1.5
 """Standard deviation of the smoothing of the coarse volume [nodes]: steps between its
 voxels would show as flaws of their own."""
-STEEP: Final = 0.05
+EDGE_CHANGE_SHARE: Final = 0.05
 """Change between nodes at an edge, relative to the object's attenuation; blur hides
 flaws there."""
 MAX_VOXEL_NODES: Final = 4.0
@@ -80,7 +80,7 @@ class Bias:
     def total(self) -> Float32Array:
         """Bound at the nodes [1/mm]."""
         flaws = np.sum(list(self.causes.values()), axis=0)
-        return np.asarray(FLOOR * np.abs(self.found.data) + flaws, np.float32)
+        return np.asarray(FDK_ERROR_SHARE * np.abs(self.found.data) + flaws, np.float32)
 
     def bound(self, grid: Volume) -> Float32Array | None:
         """Compute the bound at each voxel of a grid, (nz, ny, nx) [1/mm].
@@ -161,10 +161,12 @@ def _bias_of(scan: CoarseScan) -> Bias:
     unseen = np.isnan(data) | scan.rim
     data = np.nan_to_num(data)
     sharp = np.where(scan.rim, np.float32(0.0), data)
-    smooth = (min(SMOOTH, (len(data) - 1) / 4), SMOOTH, SMOOTH)
+    smooth = (min(SMOOTHING_NODES, (len(data) - 1) / 4), SMOOTHING_NODES, SMOOTHING_NODES)
     found = gaussian_filter(sharp, smooth, mode="nearest")
     typical = _typical(sharp)
-    even = np.where(unseen, 0.0, _evenness(found, STEEP * typical)) + 1e-3  # a mean needs weight
+    even = (
+        np.where(unseen, 0.0, _evenness(found, EDGE_CHANGE_SHARE * typical)) + 1e-3
+    )  # a mean needs weight
     # Half of what is about them, and a quarter of what is usual: more than streaks in the air.
     inside = (sharp > 0.5 * found) & (np.minimum(sharp, found) > 0.25 * typical) & ~unseen
     causes: dict[str, FloatArray] = {}
@@ -179,15 +181,15 @@ def _bias_of(scan: CoarseScan) -> Bias:
         # Streaks come from edges, and do not cancel about a node.
         wide = (max(scan.ends),) * 2
         best, ours = (scan.seen(sharp, scan.parallel("", wide, t)) for t in (None, scan.angles))
-        add("angles", SAFETY, np.abs(ours - best))
+        add("angles", SAFETY_FACTOR, np.abs(ours - best))
     rungs = [(rung.flaw, scan.seen(found, rung)) for rung in scan.ladder()]
     for (_, before), (flaw, after) in pairwise(rungs):
-        add(flaw, SAFETY, after - before)
+        add(flaw, SAFETY_FACTOR, after - before)
     truncation = scan.truncation
     if truncation is not None and truncation.cut_off.any():
-        ways = [(truncation.otherwise, SAFETY)]
+        ways = [(truncation.otherwise, SAFETY_FACTOR)]
         if truncation.explained:  # but the prisms' residual at the edges is as unknown as ever
-            ways = [(truncation.otherwise, TRUSTED), (truncation.later, SAFETY)]
+            ways = [(truncation.otherwise, PRISM_ERROR_SHARE), (truncation.later, SAFETY_FACTOR)]
         for way, share in ways:
             other = np.nan_to_num(scan.fdk(scan.images, scan.cone_vec, way))
             add("beyond", share, other - data)

@@ -36,7 +36,7 @@ from flexdt.twin.reconstruction.feldkamp.fdk import fdk_parts
 NODES: Final = 40
 """Largest number of columns, rows and voxels along the longest side: bias changes
 smoothly."""
-FEWEST: Final = 4.0
+MIN_AXIS_COLUMNS: Final = 4.0
 """Least columns on either side of the axis, if the panel has so many: a narrow overlap
 stays one."""
 VIEWS: Final = 180
@@ -45,7 +45,7 @@ COMPARED_VIEWS: Final = 2.0
 """Views per column, about, of a scan whose images are compared with its volume."""
 COMPARED_ROWS: Final = 16
 """Least rows of that scan, if the panel has so many."""
-AWAY: Final = 50.0
+PARALLEL_SOURCE_RADII: Final = 50.0
 """Distance of the source for parallel rays, in radii of the scan."""
 
 
@@ -103,7 +103,7 @@ class CoarseScan:
         chosen = np.arange(0, len(at), -(-len(at) // VIEWS))
         low, high = reach(fan_angles(circle, upright(cone_vec), shape[1]))
         overlap = min(low, high) / (low + high) * shape[1]
-        across = min(-(-shape[1] // NODES), max(1, int(overlap / FEWEST)))
+        across = min(-(-shape[1] // NODES), max(1, int(overlap / MIN_AXIS_COLUMNS)))
         down = max(min(-(-shape[1] // NODES), shape[0] // 2), -(-shape[0] // NODES), 1)
         rows, cols = shape[0] // down, shape[1] // across
         part = window(cone_vec[at[chosen]], shape, (0, rows * down), (0, cols * across))
@@ -261,7 +261,7 @@ class CoarseScan:
         away = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(len(turn))])
         u = np.column_stack([-away[:, 1], away[:, 0], np.zeros(len(turn))])
         centre = np.append(self.circle.centre, self.grid.center_mm[2])
-        far = AWAY * self.circle.radius * away
+        far = PARALLEL_SOURCE_RADII * self.circle.radius * away
         # As far behind the object as the source is before it: twice as large.
         panel, down = centre - far + u * (ends[1] - ends[0]), (0.0, 0.0, -2.0 * tall)
         views = ConeVec.from_vectors(centre + far, panel, 2.0 * side * u, [down] * len(u))

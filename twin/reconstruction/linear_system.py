@@ -34,9 +34,9 @@ from flexdt.twin.projection.operators import (
 from flexdt.twin.projection.volume import DeviceVolume
 from flexdt.twin.reconstruction.scatter_correction import Polychromatic
 
-SMALLEST = 1e-6
+MIN_WEIGHT_SHARE = 1e-6
 """Least sum of weights that is divided by, as a share of the largest."""
-MOST_FINER = 100
+MAX_VOXEL_RATIO = 100
 """Largest number of voxels about a region, in multiples of the requested number."""
 STACKS, VOLUMES = 4, 5
 """Largest number of stacks of images, and of volumes, that a method holds at a time."""
@@ -276,7 +276,7 @@ class RegionSystem(LinearSystem):
             said = f"surroundings {wanted!r} within the region {inner.like!r}"
             raise GeometryError.instead(said, list(wanted.shape), "a grid that reaches beyond it")
         counts = below + parts + above
-        most = MOST_FINER * (math.prod(wanted.shape) + math.prod(inner.like.shape))
+        most = MAX_VOXEL_RATIO * (math.prod(wanted.shape) + math.prod(inner.like.shape))
         if counts.prod() > most:
             said = f"{counts.prod():.3g} voxels, none larger than the region {inner.like!r}"
             less = f"{most}, by a larger region or nearer surroundings"
@@ -369,9 +369,9 @@ def inverse(values: Float32Array) -> Float32Array:
 @singledispatch
 def ratio(a: Any, b: Any) -> Any:
     """Compute a / b, zero where b is (nearly) zero."""
-    return np.divide(a, b, out=np.zeros_like(b), where=b > SMALLEST * float(b.max()))
+    return np.divide(a, b, out=np.zeros_like(b), where=b > MIN_WEIGHT_SHARE * float(b.max()))
 
 
 @ratio.register
 def _(a: DeviceArray, b: DeviceArray) -> DeviceArray:
-    return a.over(b, SMALLEST * b.max())
+    return a.over(b, MIN_WEIGHT_SHARE * b.max())

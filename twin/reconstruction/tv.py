@@ -41,14 +41,14 @@ from flexdt.twin.signatures import public, with_arguments_of
 
 WEIGHT = 1e-2
 """Default strength as a part of max(A' b); see docs/operator.md for how it was chosen."""
-INNER = 10
+DUAL_STEPS = 10
 """Steps of the dual method in an iteration."""
-WORTH_A_PASS = 0.05
+MIN_PASS_GAIN = 0.05
 """Least share of the cost that a pass through subsets must gain; else their number is
 halved."""
-NORM = 1e-2
+NORM_TOLERANCE = 1e-2
 """Relative tolerance of the operator's norm."""
-IN_A_ROW = 3
+STALLED_ITERATIONS = 3
 """Consecutive iterations of little gain after which it ends."""
 
 
@@ -189,7 +189,7 @@ def _minimised(
     objective = _Objective(problem, strength, regular)
     at = objective.at(objective.regular.allow(problem.first(start)))
     costs = [at.cost]
-    norm = norm_of(problem.project, problem.spread, ones(problem.first(None)), NORM)
+    norm = norm_of(problem.project, problem.spread, ones(problem.first(None)), NORM_TOLERANCE)
     if norm == 0.0:
         return Minimised(problem.volume(at.x), tuple(costs), True, strength)
     step = 1.0 / (1.02 * norm) ** 2  # the estimate of the norm is from below
@@ -202,12 +202,12 @@ def _minimised(
         costs.append(at.cost)
         advance((len(costs) - 1) / iterations)
         little = little + 1 if costs[-2] - at.cost <= tolerance * at.cost else 0
-        return tolerance > 0 and little >= IN_A_ROW
+        return tolerance > 0 and little >= STALLED_ITERATIONS
 
     count = min(subsets, len(problem.geometry))
     while count > 1 and len(costs) <= iterations:
         tried = objective.at(objective.subset_pass(at.x, step, count))
-        if tried.cost < (1 - WORTH_A_PASS) * at.cost:
+        if tried.cost < (1 - MIN_PASS_GAIN) * at.cost:
             tell(tried)
             at = tried
         else:
@@ -332,7 +332,7 @@ class Regular:
         # The squared norm of the differences is at most 4 sum(scale^2).
         rate = np.float32(1.0 / (4.0 * theta * float((self.scale**2).sum())))
         t = 1.0
-        for _ in range(INNER):
+        for _ in range(DUAL_STEPS):
             self.primal_step(z, ahead, np.float32(theta), x)
             t, further = momentum(t)
             self.dual_step(x, ahead, rate, np.float32(further))

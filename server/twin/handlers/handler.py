@@ -31,7 +31,7 @@ Item = TypeVar("Item")
 View = TypeVar("View")
 _P = TypeVar("_P", bound=Params)
 _R = TypeVar("_R", bound=Result)
-A_TURN = 20
+ITEMS_A_TURN = 20
 """Items of a list processed in one turn of the loop, well below a millisecond."""
 HANDLERS: dict[str, Handler] = {}
 """Method name -> handler; filled as the modules of `handlers` are imported."""
@@ -95,14 +95,14 @@ async def in_turns(items: Sequence[Item], view: Callable[[Item], View]) -> list[
     views = []
     for at, item in enumerate(items, start=1):
         views.append(view(item))
-        if at % A_TURN == 0 and at < len(items):
+        if at % ITEMS_A_TURN == 0 and at < len(items):
             await asyncio.sleep(0.0)
     return views
 
 
 async def encoded_apart(client: Client, result: _R, count: int) -> _R | Encoded:
     """Return a result of `count` items; a long one is encoded in a thread."""
-    if count <= A_TURN:
+    if count <= ITEMS_A_TURN:
         return result
     return await asyncio.to_thread(encoded, result, client.peer.codec)
 

@@ -17,7 +17,7 @@ from flexdt.server.twin.handlers import handler as h
 from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.scanner.state import Sample, StagePlacement
 
-NAMED = 50
+MAX_NAMED_UPLOADS = 50
 """Number of the newest uploads that an error lists."""
 
 
@@ -190,7 +190,7 @@ def _upload_info(head: UploadHead) -> p.SampleInfo:
 
 
 def _unknown(twin: TwinServer, name: str) -> UnknownNameError:
-    uploads = list(twin.samples.uploads)[-NAMED:]
+    uploads = list(twin.samples.uploads)[-MAX_NAMED_UPLOADS:]
     older = len(twin.samples.uploads) - len(uploads)
     more = f"{older} older ones and " if older else ""
     there = f"there are: {more}{', '.join(uploads)}" if uploads else "nothing has been uploaded yet"

@@ -23,13 +23,13 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Volume
 from flexdt.twin.reconstruction.acquisition.trajectory import Circle, fan_angles, no_fdk, reach
 
-LEAST_SEEN: Final = 0.4
+MIN_SEEN_SHARE: Final = 0.4
 """Least share of the weight of all views that must see a voxel. At the panel's upper
 and lower edge it is about half in a full turn."""
-ALL_LINES: Final = 0.97
+MIN_LINES_SHARE: Final = 0.97
 """Share of the directions in which a voxel must be seen where the panel cuts the
 object off, less the arc of one view."""
-MOST_VIEWS: Final = 360
+MAX_VIEWS: Final = 360
 """Largest number of views by which coverage is judged, evenly over the circle."""
 
 
@@ -72,13 +72,13 @@ def normalise_coverage(
     if not cut_off and row.min() >= 0.0 and row.max() <= rows - 1:
         return
     order = np.argsort(circle.angle, kind="stable")
-    starts = np.arange(0, len(order), -(-len(order) // MOST_VIEWS))
+    starts = np.arange(0, len(order), -(-len(order) // MAX_VIEWS))
     middle = order[(starts + np.append(starts[1:], len(order))) // 2]
     step = np.add.reduceat(circle.step[order], starts)
     fdk_kernels.normalise_coverage(
         np.ascontiguousarray(table[middle]), weights[middle] * step[:, None], rows,
-        np.array(panel) + (-0.5, 0.5), circle.radius, *first, *size, LEAST_SEEN,
-        (ALL_LINES * np.pi - circle.step.max()) * cut_off, data,
+        np.array(panel) + (-0.5, 0.5), circle.radius, *first, *size, MIN_SEEN_SHARE,
+        (MIN_LINES_SHARE * np.pi - circle.step.max()) * cut_off, data,
     )  # fmt: skip
 
 
@@ -106,7 +106,7 @@ def layer_warnings(lost: int, layers: int) -> list[str]:
 
 DEPTHS = 64
 """Number of depths at which shares are tabulated."""
-ENDS = 0.2
+HELIX_TAPER_RAD = 0.2
 """Angle over which views count less towards the ends of the helix [rad]."""
 
 
@@ -183,7 +183,7 @@ class Sharing:
             off = np.abs(row + (k * turn)[..., None].astype(np.float32)) / np.float32(self.rows / 2)
             part = np.maximum(np.float32(1.0) - off, 0)
             part *= part * (3 - 2 * part)
-            part *= np.clip(end / ENDS, 0.0, 1.0)[:, None, None].astype(np.float32)
+            part *= np.clip(end / HELIX_TAPER_RAD, 0.0, 1.0)[:, None, None].astype(np.float32)
             total = total + part
             own = part if k == 0 else own
         return np.asarray(own / total)

@@ -21,27 +21,27 @@ from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
-FLATNESS = 0.03
+MAX_CIRCLE_DEVIATION = 0.03
 """Largest deviation of the sources from a horizontal circle, relative to its radius."""
-TAPER = 4.0
+TAPER_REACHES = 4.0
 """Width of the weights' transition, relative to the detector's additional reach on one
 side."""
-NARROWEST = 24
+MIN_TAPER_COLS = 24
 """Least width of that transition [columns]."""
-LEAST = 3e-3
+MIN_CONFIDENCE = 3e-3
 """Confidence in the rays at the panel's near edge, relative to that in their opposites. It decides
 only where an opposite ray was hardly seen: next to a gap of the angles."""
-MOST_COLUMNS = 8
+MAX_PANEL_WIDTHS = 8
 """Largest width to which a panel moved to one side is continued, over its columns."""
-LEVEL = 1e-3
+MAX_CIRCLE_RISE = 1e-3
 """Largest rise over a circular scan, relative to the radius."""
-UNSTEADY = 0.05
+MAX_HELIX_DEVIATION = 0.05
 """Largest deviation of a helix from a steady rise, relative to the rise in a turn."""
-UNEVEN, MOST_UNEVEN = 3.0, 8.0
+GAP_STEPS, RANDOM_GAP_STEPS = 3.0, 8.0
 """Steps between neighbouring views, relative to the usual one, from which on they are
 gaps. The first holds where the views behind cover all of them, as in a scan that left
 some out; else the second, as for random views."""
-RAMP = 0.35
+GAP_RAMP_RAD = 0.35
 """Angle over which the confidence in views falls towards a gap; a fan of as much on
 either side is wide, so that views behind a gap that cover it do so for any panel
 [rad]."""
@@ -112,11 +112,11 @@ def circle_of(cone_vec: ConeVec) -> Circle:
     worst = float(np.abs(np.linalg.norm(s[:, :2] - centre, axis=1) - radius).max())
     if helix is None:
         worst = max(worst, float(np.abs(s[:, 2] - s[:, 2].mean()).max()))
-    if worst > FLATNESS * radius:
+    if worst > MAX_CIRCLE_DEVIATION * radius:
         raise no_fdk(
             f"the sources leave a horizontal circle of radius {radius:.4g} mm by {worst:.4g} mm; "
             "FDK needs a circle, or a helix that rises steadily for a turn or more and has no gap "
-            "of angles", worst, FLATNESS * radius,
+            "of angles", worst, MAX_CIRCLE_DEVIATION * radius,
         )  # fmt: skip
     return helix or _turn(azimuth % TURN, centre, radius)
 
@@ -155,10 +155,10 @@ def _turn(azimuth: FloatArray, centre: FloatArray, radius: float) -> Circle:
     # The widest may be the gap of a short scan, so that it does not say what is usual. A step of
     # more than a third of the circle is a gap even of few views: three even ones just reach it.
     usual = _usual(np.delete(ahead, ahead.argmax()))
-    for most in (UNEVEN, MOST_UNEVEN):
+    for most in (GAP_STEPS, RANDOM_GAP_STEPS):
         open_ = (ahead > most * usual) | (ahead > TURN / 3 + 1e-6)
         gaps = np.column_stack([at, at + ahead])[open_]
-        if _unseen(gaps, RAMP) <= 0.0:
+        if _unseen(gaps, GAP_RAMP_RAD) <= 0.0:
             break
     ahead_half = np.where(open_, 0.0, ahead / 2)
     step = (ahead_half + np.roll(ahead_half, 1)) / np.bincount(same)
@@ -182,17 +182,17 @@ def _helix(
     run = np.empty(len(order))
     run[order] = np.unwrap(azimuth[order])
     span = float(np.ptp(run))
-    if np.ptp(height) <= LEVEL * radius or span * len(run) / (len(run) - 1) < TURN - 1e-6:
+    if np.ptp(height) <= MAX_CIRCLE_RISE * radius or span * len(run) / (len(run) - 1) < TURN - 1e-6:
         return None
     slope, level = np.polyfit(run, height, 1)
-    if np.abs(height - level - slope * run).max() > UNSTEADY * TURN * abs(slope):
+    if np.abs(height - level - slope * run).max() > MAX_HELIX_DEVIATION * TURN * abs(slope):
         return None
     # The ends of a helix need not meet: the first and the last view stand for whole steps.
     run *= np.sign(slope)
     order = np.argsort(run, kind="stable")
     gaps = np.diff(run[order])
     usual = _usual(gaps)
-    if gaps.max() > MOST_UNEVEN * usual:
+    if gaps.max() > RANDOM_GAP_STEPS * usual:
         return None
     ahead = np.concatenate([[usual], gaps, [usual]]) / 2
     step = np.empty(len(run))
@@ -223,10 +223,10 @@ def redundancy(circle: Circle, cone_vec: ConeVec, cols: int, *, beyond: bool = F
         )
     _check_covered(circle, float(np.abs(fan).max()))
     column, overlap = (low + high) / cols, min(low, high)
-    least = 0.0 if circle.full else LEAST
+    least = 0.0 if circle.full else MIN_CONFIDENCE
     alone = np.zeros_like(fan)  # +1 where only the ray itself falls on the panel, -1 its opposite
     if abs(high - low) > column and (circle.full or beyond):
-        taper = min(overlap, max(TAPER * abs(high - low), NARROWEST * column))
+        taper = min(overlap, max(TAPER_REACHES * abs(high - low), MIN_TAPER_COLS * column))
         side = fan if high > low else -fan
         past = np.clip((np.abs(side) - (overlap - taper)) / taper, 0.0, 1.0)
         alone = np.sign(side) * (1 - least) * np.sin(np.pi / 2 * past) ** 2
@@ -240,7 +240,7 @@ def narrow_overlap(circle: Circle, cone_vec: ConeVec, cols: int) -> bool:
     """Return whether a panel moved aside sees few columns beyond the axis."""
     low, high = reach(fan_angles(circle, cone_vec, cols))
     column = (low + high) / cols
-    return abs(high - low) > column and min(low, high) < 2 * NARROWEST * column
+    return abs(high - low) > column and min(low, high) < 2 * MIN_TAPER_COLS * column
 
 
 def axis_between(circle: Circle, cone_vec: ConeVec, shape: tuple[int, int]) -> ConeVec:
@@ -260,7 +260,7 @@ def axis_between(circle: Circle, cone_vec: ConeVec, shape: tuple[int, int]) -> C
 def _confidence(circle: Circle, angle: FloatArray) -> FloatArray:
     """Compute the confidence, 0 to 1, of views at angles from a gap."""
     from_gap = circle.from_gap(angle)
-    return np.asarray(np.sin(np.pi / 2 * np.minimum(from_gap / RAMP, 1.0)) ** 2 + 1e-12)
+    return np.asarray(np.sin(np.pi / 2 * np.minimum(from_gap / GAP_RAMP_RAD, 1.0)) ** 2 + 1e-12)
 
 
 def _check_covered(circle: Circle, widest: float) -> None:
@@ -316,7 +316,7 @@ def columns_beyond(circle: Circle, cone_vec: ConeVec, cols: int) -> tuple[int, i
     before, after = -float(np.min(ends)), float(np.max(ends)) - (cols - 1)
     # Rounded first: sources in another order differ in the last bits, which must not decide.
     needed = np.ceil(np.round([before - 0.5, after - 0.5], 6))
-    first, last = np.clip(needed, 0, MOST_COLUMNS * cols)
+    first, last = np.clip(needed, 0, MAX_PANEL_WIDTHS * cols)
     return int(first), int(last)
 
 

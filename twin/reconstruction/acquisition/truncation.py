@@ -41,10 +41,10 @@ rays for six numbers, in milliseconds. The outermost bin is the edge."""
 BANDS = 8
 """Number of bands of rows with their own prism: few enough to average noise, and an
 outline changes little within an eighth of the panel."""
-REACH = 4.0
+MAX_PRISM_RADII = 4.0
 """Largest half axis of a prism over the radius of the field of view: wider ones look
 alike there. Rows are then continued by at most twice their length on either side."""
-SIGNIFICANT = 4.0
+SIGNIFICANT_SIGMAS = 4.0
 """Standard deviations of noise beyond which a value at an edge counts as truncation:
 of thousands of bands, views and edges none is beyond by chance."""
 ACCURACY = 0.01
@@ -299,7 +299,7 @@ def _seen_beyond(images: Sequence[Float32Array], there: npt.NDArray[np.bool_]) -
     apart = 2 * _edge(cols) + 2
     for image, columns in zip(smooth, there, strict=True):
         noise = _noise(image[:, ::apart])
-        if columns.any() and image[:, columns].max() > max(least, 2.0 * SIGNIFICANT * noise):
+        if columns.any() and image[:, columns].max() > max(least, 2.0 * SIGNIFICANT_SIGMAS * noise):
             return True
     return False
 
@@ -394,13 +394,13 @@ def _cut_off(band: FloatArray, least: float, usual: float) -> npt.NDArray[np.boo
     from scipy.ndimage import median_filter
 
     ends = band[:, [0, -1]]
-    noise = SIGNIFICANT * np.array([_noise(band[:, :5:2]), _noise(band[:, :-6:-2])])
+    noise = SIGNIFICANT_SIGMAS * np.array([_noise(band[:, :5:2]), _noise(band[:, :-6:-2])])
     some = median_filter(ends, (min(3, len(band)), 1)) > np.maximum(least, noise)
     # In the mean the flat's drift and noise show, too, and the logarithm of noise: what counts is
     # what would change densities by the accuracy. Two edges add a pi-th of their sum, at most.
     mean = band.mean(axis=0)
     apart = np.array([_noise(end) for end in ends.T]) / np.sqrt(len(ends))
-    apart = SIGNIFICANT * np.hypot(apart, _noise(mean))
+    apart = SIGNIFICANT_SIGMAS * np.hypot(apart, _noise(mean))
     every = mean[[0, -1]] > np.maximum(0.5 * np.pi * ACCURACY * usual, apart)
     return np.asarray(some.any(axis=0) | every)
 
@@ -430,7 +430,14 @@ def _fit(
     aside = source[..., 0] * ends[..., 1] - source[..., 1] * ends[..., 0]
     field = float(np.abs(aside / np.sqrt((ends**2).sum(axis=-1))).max())
     limit = np.array(
-        [REACH / 2, REACH / 2, np.log(REACH), np.log(REACH), REACH / 2, 3 * np.log(REACH)]
+        [
+            MAX_PRISM_RADII / 2,
+            MAX_PRISM_RADII / 2,
+            np.log(MAX_PRISM_RADII),
+            np.log(MAX_PRISM_RADII),
+            MAX_PRISM_RADII / 2,
+            3 * np.log(MAX_PRISM_RADII),
+        ]
     )
     middle = np.array([0.0, 0.0, 0.0, 0.0, 0.0, np.log(usual / field)])
     least, most = middle - limit, middle + limit
@@ -466,7 +473,7 @@ def _fit(
             break
     by_noise = 0.319 * _noise(rest(x))  # a quarter of normal noise is below so many deviations
     # Both are estimates; the ratio of their squares varies by 4.9 over the root of their number.
-    by_noise *= np.sqrt(1.0 + 0.5 * SIGNIFICANT * 4.9 / np.sqrt(seen.size))
+    by_noise *= np.sqrt(1.0 + 0.5 * SIGNIFICANT_SIGMAS * 4.9 / np.sqrt(seen.size))
     if np.sqrt(max(best**2 - by_noise**2, 0.0)) <= 0.5 * ACCURACY * usual:
         return Prism.of(x, field), None
     if near is not None:

@@ -25,44 +25,44 @@ from flexdt.twin.reconstruction.consistency.suspects import (
     suspects,
 )
 
-MOST_MISFIT: Final = 2.5
+MAX_MISFIT: Final = 2.5
 """Largest residual of fitting images, over that of the volume's second reconstruction:
 right ones have 0.8 to 1.9, hardened ones up to 2.2 (`tests/studies/misfits.py
 --right`)."""
-BETTER: Final = 0.92
+MAX_BETTER_MISFIT: Final = 0.92
 """Misfit of an explanation, relative to the stated geometry's, below which it is
 better: right scans have 0.96 and more."""
-MUCH_BETTER: Final = 0.7
+MAX_MUCH_BETTER_MISFIT: Final = 0.7
 """The same where the panel cuts the object off, whose outer parts no volume holds, and
 where the coarse volume shows no edges."""
-DOUBTFUL: Final = 1.4
+MIN_DOUBTFUL_MISFIT: Final = 1.4
 """Residual over that of the second reconstruction, below which images fit and nothing
 is tried: more than half of right scans; wrong ones that are detected have 1.44 and
 more."""
-TELLING: Final = 0.3
+MAX_RELIABLE_RESIDUAL: Final = 0.3
 """Residual of the second reconstruction, over the images, below which it is reliable:
 one of few views or few columns beyond the axis has larger ones."""
-FEWEST_VIEWS: Final = 1.6
+MIN_VIEWS_A_COLUMN: Final = 1.6
 """Least views for a coarse column; with fewer, streaks hide contradictions."""
-LEAST: Final = 12
+MIN_VIEWS: Final = 12
 """Least number of views and coarse columns; with fewer a volume fits anything and no
 result is given."""
-UNEVEN: Final = 2.0
+MAX_ARC_RATIO: Final = 2.0
 """Widest over usual angle of a view, above which views are random and weights are
 rough."""
-AS_GOOD: Final = 1.05
+EQUAL_MISFIT_RATIO: Final = 1.05
 """Largest misfit of an equally good explanation, over the best one's."""
-ALL_NOISE: Final = 0.01
+MIN_SIGNAL_SHARE: Final = 0.01
 """Share of a residual that is never attributed to noise."""
-PROBE: Final = 0.35
+PROBE_COLUMNS: Final = 0.35
 """Movement of the panel to find the side on which it fits better [coarse columns]."""
-FAR: Final = 3.0
+FAR_PROBE_COLUMNS: Final = 3.0
 """The same if images do not fit at all [coarse columns]."""
 UNEXPLAINED: Final = (
     "No other direction, order, mirror or offset explains it; motion during the scan does, images "
     "in a wrong order, and images that are not line integrals of one object"
 )
-STEPS: Final = 7
+MAX_PROBE_STEPS: Final = 7
 """Number of further movements of the panel, each twice as far."""
 
 
@@ -106,7 +106,7 @@ def contradiction_of(scan: CoarseScan) -> Contradiction | None:
     Returns:
         None if they fit, for helices, and for scans of too few views or columns.
     """
-    if scan.circle.rise or min(len(scan.circle.step), scan.images.shape[2]) < LEAST:
+    if scan.circle.rise or min(len(scan.circle.step), scan.images.shape[2]) < MIN_VIEWS:
         return None
     thin = scan.thinned()
     trial = _Trial(thin)
@@ -140,23 +140,27 @@ class _Trial:
         assert own is not None  # as a scan has a volume
         self.misfit = own.misfit()
         self.expected = self._expected(own, scan.cone_vec)
-        self.telling = self.expected < TELLING
+        self.telling = self.expected < MAX_RELIABLE_RESIDUAL
         self.excess = self._excess(own, self.expected)
         step = scan.circle.step
-        enough = len(step) >= FEWEST_VIEWS * scan.images.shape[2]
-        self.even = bool(enough and step.max() <= UNEVEN * np.median(step))
+        enough = len(step) >= MIN_VIEWS_A_COLUMN * scan.images.shape[2]
+        self.even = bool(enough and step.max() <= MAX_ARC_RATIO * np.median(step))
 
     def verdict(self) -> Contradiction | None:
         """Find the error of the scan's geometry; None if there is none."""
-        if not self.telling.any() or self.excess < DOUBTFUL:
+        if not self.telling.any() or self.excess < MIN_DOUBTFUL_MISFIT:
             return None
-        unfit = self.whole and self.even and self.excess > MOST_MISFIT
-        better = BETTER if self.whole and self.even and self.telling.all() else MUCH_BETTER
+        unfit = self.whole and self.even and self.excess > MAX_MISFIT
+        better = (
+            MAX_BETTER_MISFIT
+            if self.whole and self.even and self.telling.all()
+            else MAX_MUCH_BETTER_MISFIT
+        )
         tried = [self._tried(reversed_turn(self.scan)), *self._beside(unfit)]
         tried += [self._tried(one) for one in suspects(self.scan, whole=self.whole and self.even)]
         best = min(tried, key=lambda one: one.score)
         if best.score < better and self._explains(best):
-            as_good = [one for one in tried if one.score <= AS_GOOD * best.score]
+            as_good = [one for one in tried if one.score <= EQUAL_MISFIT_RATIO * best.score]
             named = {one.suspect.kind: one.suspect.figure for one in as_good}
             kinds, figures = tuple(named), tuple(named.values())
             return Contradiction(self.excess, kinds, best.score, figures)
@@ -167,7 +171,7 @@ class _Trial:
         if one.shown is None:
             return False
         expected = self._expected(one.shown, one.suspect.cone_vec)
-        return self._excess(one.shown, expected) <= MOST_MISFIT
+        return self._excess(one.shown, expected) <= MAX_MISFIT
 
     def _expected(self, shown: Reprojection, cone_vec: ConeVec) -> FloatArray:
         """Compute the misfit of a volume's second reconstruction, infinite without one,
@@ -180,7 +184,7 @@ class _Trial:
         """Compute the misfit relative to the expected one: by edges, if the coarse volume
         has some.
         """
-        return float((shown.misfit(ALL_NOISE) / expected)[1 if self.telling[1] else 0])
+        return float((shown.misfit(MIN_SIGNAL_SHARE) / expected)[1 if self.telling[1] else 0])
 
     def _tried(self, suspect: Suspect) -> _Tried:
         # The explanation of a scan also explains why it seemed cut off.
@@ -211,11 +215,11 @@ class _Trial:
                 known[columns] = tried[columns].score
             return known[columns]
 
-        side = min((-PROBE, PROBE), key=score)
+        side = min((-PROBE_COLUMNS, PROBE_COLUMNS), key=score)
         if unfit and score(side) >= 1.0:
-            side = min((-FAR, FAR), key=score)
+            side = min((-FAR_PROBE_COLUMNS, FAR_PROBE_COLUMNS), key=score)
         at = side
-        for _ in range(STEPS):
+        for _ in range(MAX_PROBE_STEPS):
             if score(at) >= min(value for place, value in known.items() if place != at):
                 break
             at *= 2.0

@@ -21,33 +21,33 @@ from flexdt.twin.geometry.conventions import Float32Array
 NEIGHBOURS: Final = 2
 """Columns on either side that a pixel is compared with: each of two bad columns has
 good ones."""
-TIMES: Final = 8.0
+BAD_RESPONSE_RATIO: Final = 8.0
 """Response of a bad pixel over the usual one about it."""
-LEAST: Final = 0.02
+MIN_BAD_RESPONSE: Final = 0.02
 """Least response of a bad pixel: smaller errors of line integrals do little harm."""
-STEEPER: Final = 3.0
+EDGE_SLOPE_FACTOR: Final = 3.0
 """Factor by which a slope may grow towards the panel's edges, whose pixels have one
 side alone."""
-LEAST_AT_EDGE: Final = 0.3
+MIN_EDGE_RESPONSE: Final = 0.3
 """Least response of a bad pixel at the panel's edges."""
-PASSING: Final = 5
+VIEWS_AN_OUTLIER: Final = 5
 """One of this many views is left out, that where a pixel is farthest beyond its
 neighbours."""
 BLOCK: Final = (8, 16)
 """Rows and columns over which the usual response is found."""
 AXIS_PART: Final = 0.2
 """Distance from the axis within which an object may hardly move, over the panel's columns."""
-WHOLE_COLUMN: Final = 0.9
+MIN_COLUMN_SHARE: Final = 0.9
 """Least share of a bad column's rows that are beyond their neighbours."""
-DEVIATES: Final = 0.5
+MIN_DEVIATION_RATIO: Final = 0.5
 """Distance beyond its neighbours, over its root mean square, from which a pixel deviates."""
-LASTING: Final = 0.75
+MIN_LASTING_SHARE: Final = 0.75
 """Least share of the views in which a dead or hot pixel deviates; a bead at the turn
 of its orbit does so in less than half of them."""
-CHANGING: Final = 0.25
+MIN_CHANGES_SHARE: Final = 0.25
 """Least share of views at which a flickering pixel changes between deviating and not;
 an object's feature comes and goes once."""
-MOST_PART: Final = 0.05
+MAX_BAD_SHARE: Final = 0.05
 """Largest share of bad pixels; above it none is bad: the images are of another kind."""
 
 
@@ -99,7 +99,7 @@ def bad_pixels(views: Callable[[], Iterable[Float32Array]], axis_column: float) 
     mask = _lasting_or_flickering(views(), worst | second)
     if not mask.any():
         return None
-    return BadPixels(mask) if mask.mean() <= MOST_PART else None
+    return BadPixels(mask) if mask.mean() <= MAX_BAD_SHARE else None
 
 
 def _outliers(
@@ -120,7 +120,7 @@ def _outliers(
     response = along.root()
     mask = _outlying(response)
     if mask[:, near].size:
-        whole = mask[:, near].mean(axis=0) > WHOLE_COLUMN
+        whole = mask[:, near].mean(axis=0) > MIN_COLUMN_SHARE
         mask[:, near] &= whole | _outlying(down.root())
     return mask, response
 
@@ -134,10 +134,12 @@ def _lasting_or_flickering(
     """
     distances = np.array([_beyond_neighbours(view)[mask] for view in views])
     usual = np.sqrt(np.mean(np.square(distances), axis=0))
-    deviates = distances > np.maximum(DEVIATES * usual, 2.0 * LEAST)
+    deviates = distances > np.maximum(MIN_DEVIATION_RATIO * usual, 2.0 * MIN_BAD_RESPONSE)
     changes = (deviates[1:] != deviates[:-1]).sum(axis=0)
     kept = np.zeros_like(mask)
-    kept[mask] = (deviates.mean(axis=0) >= LASTING) | (changes >= CHANGING * len(distances))
+    kept[mask] = (deviates.mean(axis=0) >= MIN_LASTING_SHARE) | (
+        changes >= MIN_CHANGES_SHARE * len(distances)
+    )
     return kept
 
 
@@ -171,7 +173,7 @@ class _Usual:
         """Add one image of squares, (rows, cols)."""
         self.count += 1
         self._total = square.copy() if self._total is None else self._total + square
-        if self.count % PASSING == 0:
+        if self.count % VIEWS_AN_OUTLIER == 0:
             self._largest.append(np.zeros_like(square))
         rest = square
         for kept in self._largest:
@@ -197,9 +199,9 @@ def _outlying(response: Float32Array) -> npt.NDArray[np.bool_]:
     blocks = padded.reshape(down, tall, across, wide).transpose(0, 2, 1, 3)
     usual = maximum_filter(np.median(blocks.reshape(down, across, -1), axis=2), 3, mode="nearest")
     usual = usual.repeat(tall, axis=0)[:rows].repeat(wide, axis=1)[:, :cols]
-    least = np.full(cols, LEAST)
-    least[:NEIGHBOURS] = least[-NEIGHBOURS:] = LEAST_AT_EDGE
-    return np.asarray(response > np.maximum(TIMES * usual, least))
+    least = np.full(cols, MIN_BAD_RESPONSE)
+    least[:NEIGHBOURS] = least[-NEIGHBOURS:] = MIN_EDGE_RESPONSE
+    return np.asarray(response > np.maximum(BAD_RESPONSE_RATIO * usual, least))
 
 
 def _beyond_neighbours(view: Float32Array) -> Float32Array:
@@ -214,7 +216,7 @@ def _beyond_neighbours(view: Float32Array) -> Float32Array:
     other = np.minimum(np.maximum(first, second), np.maximum(third, fourth))
     low, high = np.minimum(one, other), np.maximum(one, other)
     for ends in (slice(NEIGHBOURS), slice(-NEIGHBOURS, None)):
-        span = STEEPER * (high[:, ends] - low[:, ends])  # a slope goes on beyond them
+        span = EDGE_SLOPE_FACTOR * (high[:, ends] - low[:, ends])  # a slope goes on beyond them
         low[:, ends] -= span
         high[:, ends] += span
     np.subtract(low, view, out=low)

@@ -15,11 +15,11 @@ from flexdt.twin.reconstruction.coarse_scan import CoarseScan
 
 MEDIAN_OF_SQUARES = 0.4549
 """Median of the squares of standard normal deviates."""
-MORE_NOISE = 1.5
+NOISE_VARIANCE_RATIO = 1.5
 """Variance of noise relative to the estimate by its median: few photons deviate more."""
 NOISE_OF_CHANGES = np.array([1.0, 0.25])
 """Variance of white noise in the values, and in their changes, over that in the values."""
-LEAST_SIGNAL = 0.3
+MIN_SIGNAL_SHARE = 0.3
 """Share of a residual that is kept whatever the noise, so that of two in much noise
 none is far better than the other."""
 
@@ -62,7 +62,7 @@ class Reprojection:
         shape = (images.shape[1], images.shape[2])
         return cls(images, scan.projected(values, cone_vec, shape, fine=False))
 
-    def misfit(self, least: float = LEAST_SIGNAL) -> FloatArray:
+    def misfit(self, least: float = MIN_SIGNAL_SHARE) -> FloatArray:
         """Compute the root mean square of the residual over that of the images, without
         noise.
 
@@ -81,7 +81,7 @@ class Reprojection:
         """Mean squares of residual, images and noise: of the values, and of their changes, (2,)."""
         rest = self.again - self.images
         # Differences between neighbours in both are the object's.
-        noise = MORE_NOISE * max(_noise_of(self.images) - _noise_of(self.again), 0.0)
+        noise = NOISE_VARIANCE_RATIO * max(_noise_of(self.images) - _noise_of(self.again), 0.0)
         residual, signal = (
             np.array([_mean_square(what), _mean_square(_changes(what))])
             for what in (rest, self.images)

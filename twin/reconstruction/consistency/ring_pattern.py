@@ -28,9 +28,9 @@ NEIGHBOURHOOD_COLS: Final = 9
 """Columns over which a pixel is compared with its neighbours."""
 GROUP_VIEWS: Final = 6
 """Views in a group, whose median is computed first."""
-MOST_GROUPS: Final = 48
+MAX_GROUPS: Final = 48
 """Largest number of groups; beyond it, neighbouring groups are averaged in pairs."""
-FEWEST_GROUPS: Final = 6
+MIN_GROUPS: Final = 6
 """Least number of groups from whose distances noise is estimated."""
 COLUMN_ROWS: Final = 15
 """Rows over which a column's error is averaged."""
@@ -43,7 +43,7 @@ MEDIAN_VARIANCE: Final = 1.571
 """Variance of a median over that of the mean of as many normal deviates."""
 SIGMA_OF_MEDIAN: Final = 1.4826
 """Standard deviation of normal deviates over the median of their absolute deviations."""
-SIGMAS: Final = 4.0
+MIN_EXCESS_SIGMAS: Final = 4.0
 """Least excess of a variance over that of noise, in its standard deviations."""
 
 
@@ -68,7 +68,7 @@ def ring_errors(
         LimitError: no views.
     """
     groups = _group_medians(views, width)
-    if len(groups) < FEWEST_GROUPS:
+    if len(groups) < MIN_GROUPS:
         return np.zeros_like(groups[0])
     columns = np.stack([_column_means(group) for group in groups])
     pixels = _Pattern.of(np.subtract(groups, columns))
@@ -97,7 +97,7 @@ def _group_medians(views: Iterable[Float32Array], width: int) -> list[Float32Arr
             continue
         medians.append(np.mean(waiting, axis=0))
         waiting = []
-        if len(medians) == MOST_GROUPS:
+        if len(medians) == MAX_GROUPS:
             pairs = zip(medians[::2], medians[1::2], strict=True)
             medians = [np.asarray(0.5 * (one + other), np.float32) for one, other in pairs]
             joined *= 2
@@ -155,7 +155,7 @@ class _Pattern:
         """
         left = self.values
         power = _block_mean(np.square(left))
-        least = (1.0 + SIGMAS * np.sqrt(2.0) / BLOCK_PX) * self.noise
+        least = (1.0 + MIN_EXCESS_SIGMAS * np.sqrt(2.0) / BLOCK_PX) * self.noise
         of_pixels = power
         for alike in ways:
             other = alike(left)

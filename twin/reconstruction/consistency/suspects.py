@@ -13,9 +13,9 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.reconstruction.coarse_scan import CoarseScan
 
-INTERLACED: Final = (2, 3, 4)
+INTERLACED_PASSES: Final = (2, 3, 4)
 """Numbers of passes of interlaced scans that are tried."""
-CENTRED: Final = 0.25
+CENTRE_TOLERANCE: Final = 0.25
 """Largest distance of the axis from the panel's middle that counts as zero [coarse
 pixels]."""
 
@@ -69,7 +69,7 @@ def suspects(scan: CoarseScan, *, whole: bool) -> Iterator[Suspect]:
     """
     images, cone_vec = scan.images, scan.cone_vec
     aside, above = _axis_from_middle(scan)
-    offset = abs(aside) > CENTRED
+    offset = abs(aside) > CENTRE_TOLERANCE
     if whole or offset:
         yield Suspect("columns", np.ascontiguousarray(images[:, :, ::-1]), cone_vec)
     if offset:
@@ -80,7 +80,7 @@ def suspects(scan: CoarseScan, *, whole: bool) -> Iterator[Suspect]:
     yield Suspect("rows", np.ascontiguousarray(images[:, ::-1]), cone_vec)
     yield Suspect("turned", np.ascontiguousarray(images[:, ::-1, ::-1]), cone_vec)
     yield from _orders(scan)
-    if abs(above) > CENTRED:
+    if abs(above) > CENTRE_TOLERANCE:
         yield Suspect("height", images, moved(cone_vec, 0.0, 2.0 * above))
 
 
@@ -125,7 +125,7 @@ def _permutations(angle: FloatArray) -> Iterator[tuple[str, npt.NDArray[np.intp]
     count, listed = len(angle), np.arange(len(angle))
     steps = np.diff(np.unwrap(angle))
     if (steps > 0.0).all() or (steps < 0.0).all():
-        for passes in INTERLACED:
+        for passes in INTERLACED_PASSES:
             order = np.concatenate([listed[first::passes] for first in range(passes)])
             yield "interlaced", order, f"in {passes} passes"
         names = np.array(sorted(range(count), key=str))

@@ -44,7 +44,7 @@ from flexdt.twin.reconstruction.feldkamp.filtering import ramp
 FEW_ROWS: Final = 5
 """Rows of a panel for which voxels side by side are computed at a time. The panel
 decides, not the rows that a grid needs: slabs equal the complete volume to the bit."""
-MOST_ASIDE: Final = 0.1
+MAX_SIDEWAYS_SHARE: Final = 0.1
 """Largest sideways movement of the panel between views, over its width: jitter, not
 tiles."""
 
@@ -275,8 +275,8 @@ def _check_steady(circle: Circle, level: ConeVec, shape: tuple[int, int]) -> Non
     """
     columns = level.project_points([[*circle.centre, 0.0]], shape)[:, 0, 0]
     moved = float(np.ptp(columns))
-    if not moved <= MOST_ASIDE * shape[1]:
-        most = MOST_ASIDE * shape[1]
+    if not moved <= MAX_SIDEWAYS_SHARE * shape[1]:
+        most = MAX_SIDEWAYS_SHARE * shape[1]
         said = f"the panel moves {moved:.1f} columns sideways between the views (a tiled scan?)"
         raise no_fdk(f"{said}; FDK takes {most:.1f} at most", moved, most)
 

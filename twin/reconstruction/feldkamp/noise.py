@@ -26,17 +26,17 @@ from flexdt.twin.reconstruction.volume_errors import interpolated
 
 NODES: Final = 32
 """Largest number of nodes of the coarse grid along a side: noise changes smoothly."""
-APART: Final = 3
+MIN_ROW_DISTANCE: Final = 3
 """Least distance of two compared rows of the panel: blur correlates neighbours."""
 BANDS: Final = 16
 """Bands of the spectrum over which it is averaged."""
-AROUND: Final = 8
-POINTS: Final = 32 * AROUND
+AVERAGED_POINTS: Final = 8
+POINTS: Final = 32 * AVERAGED_POINTS
 """Places at which the variance common to all views is computed, and how many are
 averaged."""
-SIDE: Final = 5
+WINDOW_NODES: Final = 5
 """Side of the window about a node whose values are compared [nodes]."""
-MEDIAN: Final = 0.67449
+NORMAL_MEDIAN: Final = 0.67449
 """Median of the absolute values of standard normal deviates."""
 TINY: Final = float(np.finfo(np.float32).tiny)
 
@@ -102,7 +102,7 @@ class NoiseMeter:
         rows_per_mm = float(table[:, 9].mean()) / circle.radius
         size = np.array(like.voxel_xyz)
         steps = np.maximum(2, -(-np.array(like.shape[::-1]) // NODES))
-        steps[2] = max(steps[2], np.ceil(APART / (rows_per_mm * size[2])))
+        steps[2] = max(steps[2], np.ceil(MIN_ROW_DISTANCE / (rows_per_mm * size[2])))
         counts = np.maximum(1, np.array(like.shape[::-1]) // steps)
         nx, ny, nz = (int(n) for n in counts)
         dx, dy, dz = (float(s) for s in steps * size)
@@ -176,7 +176,7 @@ class NoiseMeter:
     def found(self) -> Noise | None:
         """Compute the noise after all views; None if too few rows see the grid."""
         assert self._means is not None
-        if self._means.shape[1] <= APART + 1 or np.isnan(self.data).all():
+        if self._means.shape[1] <= MIN_ROW_DISTANCE + 1 or np.isnan(self.data).all():
             return None
         alternating = self.data
         if alternating.shape[2] > 2:  # without what few views cause, which layers have in common
@@ -184,8 +184,8 @@ class NoiseMeter:
             pairs /= np.float32(np.sqrt(2.0))
             alternating = np.where(np.isnan(pairs), alternating, pairs)
         variance = _local_variance(alternating.transpose(2, 0, 1))
-        radii = self._points()[0].reshape(-1, AROUND).mean(axis=1)
-        shared = self._shared_variance().reshape(-1, AROUND).mean(axis=1)
+        radii = self._points()[0].reshape(-1, AVERAGED_POINTS).mean(axis=1)
+        shared = self._shared_variance().reshape(-1, AVERAGED_POINTS).mean(axis=1)
         centre = (float(self._circle.centre[0]), float(self._circle.centre[1]))
         return Noise(self.grid.like(variance), centre, radii, shared)
 
@@ -221,7 +221,7 @@ def _local_variance(values: Float32Array) -> Float32Array:
     if unseen.any():
         nearest = distance_transform_edt(unseen, return_distances=False, return_indices=True)
         values = values[tuple(nearest)]
-    typical = median_filter(np.abs(values), SIDE, mode="nearest") / MEDIAN
+    typical = median_filter(np.abs(values), WINDOW_NODES, mode="nearest") / NORMAL_MEDIAN
     out: Float32Array = gaussian_filter(typical**2, 1.0, mode="nearest")
     return out
 
@@ -235,7 +235,9 @@ def _spectrum(image: Float32Array, length: int) -> FloatArray:
     """
     between = 0.5 * (image[1:] + image[:-1])
     power = [
-        np.median(np.abs(np.fft.rfft(rows[APART:] - rows[:-APART])) ** 2, axis=0)
+        np.median(
+            np.abs(np.fft.rfft(rows[MIN_ROW_DISTANCE:] - rows[:-MIN_ROW_DISTANCE])) ** 2, axis=0
+        )
         for rows in (image, between)
     ]
     # Of an exponential distribution the median is log 2 times the mean; linear interpolation at any

@@ -18,12 +18,12 @@ from numba import prange
 from flexdt.twin.projection.kernels.compiling import kernel, parallel, serial
 
 PARAMETERS = 6
-MOST_STEPS = 100
+MAX_STEPS = 100
 """Largest number of evaluations of a fit: usually a dozen is enough."""
-GAIN = 1e-10
+MIN_GAIN = 1e-10
 """Relative fall of the cost below which a fit ends."""
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1.0, 1e-9, 1e9
-RIM = 1e-3
+MIN_CHORD_SHARE = 1e-3
 """Share of the longest chord, squared, below which its slope is limited: at the rim
 itself it is infinite."""
 
@@ -186,7 +186,7 @@ def _normal_equations(x, source, rays, length, seen, scale, slope, matrix, gradi
             value = unit * root / squared
             rest = value - seen[i, j] / scale
             pull = 1.0 / (1.0 + rest * rest)
-            steep = unit / (squared * math.sqrt(max(inside, RIM * squared)))
+            steep = unit / (squared * math.sqrt(max(inside, MIN_CHORD_SHARE * squared)))
             flat = value / squared
             slope[0] = steep * apart * e * f * dy
             slope[1] = -steep * apart * e * f * dx
@@ -251,7 +251,7 @@ def fit_prism(source, rays, length, seen, least, most, scale, x):
     cost = _cost(x, source, rays, length, seen, scale)
     damping = FIRST_DAMPING
     fresh = False
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_STEPS):
         if not fresh:
             _normal_equations(x, source, rays, length, seen, scale, slope, matrix, gradient)
             fresh = True
@@ -271,7 +271,7 @@ def fit_prism(source, rays, length, seen, least, most, scale, x):
             cost = other
             fresh = False
             damping = max(0.2 * damping, LEAST_DAMPING)
-            if gain <= GAIN * cost:
+            if gain <= MIN_GAIN * cost:
                 break
         else:
             damping *= 5.0
