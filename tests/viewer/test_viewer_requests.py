@@ -128,6 +128,8 @@ WRONG = [
     ("viewer.block", {"name": "a", "what": "below"}),
     ("viewer.voxel", {"name": "a", "at": [0, 0, -1]}),
     ("viewer.compare", {"truth": "hidden"}),
+    ("viewer.preset", {"view": "below"}),
+    ("viewer.preset", {"aspect": 0.0}),
     ("calibration.apply", {"parameters": {}}),
     ("calibration.apply", {"parameters": {"alpha": "0.2"}}),
 ]

@@ -27,7 +27,7 @@ from flexdt.clients.viewer.scenes.layers import LAYERS, Shown
 from flexdt.clients.viewer.scenes.meshes.collision_bodies import bare, grown
 from flexdt.clients.viewer.scenes.meshes.painted_meshes import glb
 from flexdt.clients.viewer.scenes.meshes.part_looks import pieces_of
-from flexdt.clients.viewer.scenes.sample_looks import MeshCache, fetch
+from flexdt.clients.viewer.scenes.sample_looks import MeshCache, SampleLook, Skin, fetch
 from flexdt.clients.viewer.scenes.views import beam_view
 from flexdt.clients.viewer.scenes.world import World, beads_on, placed, quaternion
 from flexdt.clients.viewer.scrubbed_plan import (
@@ -334,6 +334,8 @@ def test_the_scene_draws_the_machines_own_margin() -> None:
             near = ("xray_source", "sample_holder")
             assert seen(kind, Shown(), near) == set(near)
         triangle = np.array([[0, 1, 2]], dtype=np.int32)
+        skin = Skin("ball", np.eye(3, dtype=np.float32), triangle, (200, 90, 80), False)
+        scene.wear(SampleLook((skin,), np.empty((0, 3))))
         for points in (np.ones((3, 3)), np.arange(9.0).reshape(3, 3), None, None):
             scene.show_surface(points, triangle)
             there = server.scene.get_handle_by_name("/object/surface")
