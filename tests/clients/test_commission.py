@@ -29,7 +29,9 @@ LOG = Path(__file__).parents[1] / "data" / "logs" / "unitom_xl_201106_001.txt"
 def require_right(out: laboratories.Outcome) -> None:
     assert out.wrong == []
     assert len(out.columns) >= 3
-    assert max(map(abs, out.columns.values())) < 0.05
+    # A gap beside the axis that images cannot exclude widens the sigma of a column.
+    for name, error in out.columns.items():
+        assert abs(error) < max(0.05, 2.0 * out.column_sigmas[name]), (name, error)
     assert set(out.pulls) == {"axs_tan", "det_tan", "det_roll_deg", "drift"}
     assert all(abs(pull) < 3.0 for pull in out.pulls.values())
     assert out.missed == []

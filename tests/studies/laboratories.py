@@ -31,6 +31,7 @@ class Outcome:
     Attributes:
         wrong: axes whose limits, rates, or sign are not exactly the hidden ones.
         columns: error of the fitted column of each scan that is not displaced [px].
+        column_sigmas: standard deviation that is stated of each of them [px].
         pulls: (error in sigmas) of drift and det_tan.
         missed: planted contradictions that are not named.
         false: what is named and was not planted.
@@ -39,6 +40,7 @@ class Outcome:
     found: Commissioned
     wrong: list[str] = field(default_factory=list)
     columns: dict[str, float] = field(default_factory=dict)
+    column_sigmas: dict[str, float] = field(default_factory=dict)
     pulls: dict[str, float] = field(default_factory=dict)
     missed: list[tuple[str, str]] = field(default_factory=list)
     false: list[tuple[str, ...]] = field(default_factory=list)
@@ -57,6 +59,8 @@ def judged(lab: Laboratory, found: Commissioned) -> Outcome:
     fitted = {Path(name).name: c[1] for name, c in found.offsets.columns.items()}
     out.columns = {p.name: fitted[p.name] - p.column for p in lab.scans
                    if p.name in fitted and not p.aside}  # fmt: skip
+    stated = {Path(name).name: c[2] for name, c in found.offsets.columns.items()}
+    out.column_sigmas = {name: stated[name] for name in out.columns}
     lines = found.offsets.lines
     for name, true in (
         ("axs_tan", lab.axs_tan + lab.hidden_axs), ("det_tan", lab.det_tan + lab.hidden_det),
