@@ -63,13 +63,26 @@ export function nearSample() { for (const view of open.keys())
     if (view !== "beam")
         void closer(view); }
 const still = $("#still"), CLOSE_UP_MS = 700;
-still.addEventListener("error", () => { still.hidden = true; });
+const STILL_AGAIN_MS = 1000;
+let live = false;
+// A busy server answers late with no picture: ask again until a frame has drawn the scene.
+function missing() {
+    still.hidden = true;
+    setTimeout(() => { if (!live)
+        window.still(still, window.firstView, $("#views")); }, STILL_AGAIN_MS);
+}
+still.addEventListener("error", missing);
+still.addEventListener("load", () => { still.hidden = live; });
+if (still.complete && !still.naturalWidth)
+    missing();
 window.addEventListener("message", (e) => {
-    for (const { box, iframe } of open.values())
-        if (e.source === iframe.contentWindow && e.data === "drawn") {
-            box.classList.add("live");
-            still.hidden = true;
-        }
+    for (const { box, iframe } of open.values()) {
+        if (e.source !== iframe.contentWindow || e.data !== "drawn")
+            continue;
+        box.classList.add("live");
+        live = true;
+        still.hidden = true;
+    }
 });
 let posed = "", seenAt = -Infinity;
 on("state", (s) => {
@@ -89,6 +102,7 @@ function closeUps() {
 // Without WebGL there are no scenes; all the rest works.
 function bare() {
     document.body.dataset.webgl = "none";
+    live = true;
     still.hidden = true;
     $("#views").replaceChildren(el("p", { class: "bare muted" }, "This browser draws no 3-D pictures (WebGL is off). Radiograph, axes and scans work without."));
     for (const button of $$("#view-switch button"))

@@ -67,9 +67,23 @@ export function nearSample(): void { for (const view of open.keys()) if (view !=
 // What the viewer computes: the view until its frame has drawn the machine, and the sample, large, beside it.
 declare global { interface Window { still: (image: HTMLImageElement, view: string, size: { clientWidth: number; clientHeight: number }) => void } }
 const still = $<HTMLImageElement>("#still"), CLOSE_UP_MS = 700;
-still.addEventListener("error", () => { still.hidden = true; });
+const STILL_AGAIN_MS = 1000;
+let live = false;
+// A busy server answers late with no picture: ask again until a frame has drawn the scene.
+function missing(): void {
+  still.hidden = true;
+  setTimeout(() => { if (!live) window.still(still, window.firstView, $("#views")); }, STILL_AGAIN_MS);
+}
+still.addEventListener("error", missing);
+still.addEventListener("load", () => { still.hidden = live; });
+if (still.complete && !still.naturalWidth) missing();
 window.addEventListener("message", (e) => {
-  for (const { box, iframe } of open.values()) if (e.source === iframe.contentWindow && e.data === "drawn") { box.classList.add("live"); still.hidden = true; }
+  for (const { box, iframe } of open.values()) {
+    if (e.source !== iframe.contentWindow || e.data !== "drawn") continue;
+    box.classList.add("live");
+    live = true;
+    still.hidden = true;
+  }
 });
 let posed = "", seenAt = -Infinity;
 on("state", (s) => {
@@ -85,7 +99,9 @@ function closeUps() {
 
 // Without WebGL there are no scenes; all the rest works.
 function bare() {
-  document.body.dataset.webgl = "none"; still.hidden = true;
+  document.body.dataset.webgl = "none";
+  live = true;
+  still.hidden = true;
   $("#views").replaceChildren(el("p", { class: "bare muted" }, "This browser draws no 3-D pictures (WebGL is off). Radiograph, axes and scans work without."));
   for (const button of $$<HTMLButtonElement>("#view-switch button")) button.disabled = true;
 }
