@@ -214,7 +214,7 @@ def small(lab: Lab, twin: TwinClient) -> Iterator[None]:
 
 
 @pytest.mark.slow
-@pytest.mark.campaign(1)
+@pytest.mark.campaign
 @pytest.mark.parametrize("seed", range(SEEDS))
 def test_no_statement_of_the_page_contradicts_the_wire(
     page: Any, lab: Lab, small: None, seed: int
