@@ -4,6 +4,7 @@
 import { $, $button, $select, clicks, el, setText } from "./dom.js";
 import { command, call, emit, on, store } from "./link.js";
 import { folder } from "./data.js";
+import { isUnfinished } from "./job_words.js";
 import { reconstruct, watch } from "./volume.js";
 const LEAST_VIEWS = 91;
 const MOST_VIEWS = 151;
@@ -107,7 +108,7 @@ on("job", (job) => {
         return;
     }
     setText(note, `${job.frames_done} of ${job.frames_total} images`);
-    if (["failed", "aborted", "incomplete"].includes(job.state)) {
+    if (isUnfinished(job)) {
         mine = null;
         busy = false;
     }

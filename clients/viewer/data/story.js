@@ -6,6 +6,7 @@ import { $, clicks, el, fixed, setText, words } from "./dom.js";
 import { call, command, emit, on, store } from "./link.js";
 import { apply } from "./calibrate.js";
 import { folder } from "./data.js";
+import { isUnfinished } from "./job_words.js";
 import { scanIt } from "./scan_it.js";
 const PHANTOM = "lego";
 // What is estimated: the usual parameters, and the panel's roll. Beads hardly tell its tilt
@@ -130,7 +131,7 @@ on("job", (told) => {
         dataset = folder(told);
         show("Reconstructing, and comparing with the truth …");
     }
-    else if (["failed", "aborted", "incomplete"].includes(told.state)) {
+    else if (isUnfinished(told)) {
         failed(`The scan is ${told.state}.`);
     }
 });

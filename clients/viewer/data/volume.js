@@ -7,6 +7,7 @@ import { folder } from "./data.js";
 import { extent, index, slices, valueOf } from "./slices.js";
 import { raycast } from "./raycast.js";
 import { shared } from "./shared.js";
+import { isOver } from "./job_words.js";
 import { otsu } from "./otsu.js";
 const KEY = "flexdt-volume", STARTING = "starting; dark, flat and a first image are needed", EXACT_MS = 60;
 const SHOWN = { volume: "volume", sigma: "noise (standard deviation)", bias_bound: "bound of the bias", other: "the other geometry", truth: "truth of the sample", difference: "volume − truth" };
@@ -80,8 +81,9 @@ export function watch() { size.value ||= "128"; past = null; reveal = true; ask(
 on("reconstruct", (name) => reconstruct(name));
 on("job", (job) => {
     ask();
-    if (note.textContent === STARTING && ["done", "failed", "aborted", "incomplete"].includes(job.state))
+    if (note.textContent === STARTING && isOver(job)) {
         setText(note, `the scan has ended (${job.state}) before its first slices`);
+    }
 });
 on("state", (s) => { if (s.job)
     ask(); });

@@ -8,6 +8,7 @@ import { folder } from "./data.js";
 import { extent, index, slices, valueOf } from "./slices.js";
 import { raycast } from "./raycast.js";
 import { shared } from "./shared.js";
+import { isOver } from "./job_words.js";
 import { otsu } from "./otsu.js";
 
 const KEY = "flexdt-volume", STARTING = "starting; dark, flat and a first image are needed", EXACT_MS = 60;
@@ -64,7 +65,9 @@ export function watch(): void { size.value ||= "128"; past = null; reveal = true
 on("reconstruct", (name) => reconstruct(name));
 on("job", (job) => {
   ask();
-  if (note.textContent === STARTING && ["done", "failed", "aborted", "incomplete"].includes(job.state)) setText(note, `the scan has ended (${job.state}) before its first slices`);
+  if (note.textContent === STARTING && isOver(job)) {
+    setText(note, `the scan has ended (${job.state}) before its first slices`);
+  }
 });
 on("state", (s) => { if (s.job) ask(); });
 on("open", () => { asked = null; });
