@@ -13,13 +13,13 @@ from flexdt.library.datasets.image_set import ImageSet
 from flexdt.library.figures import require_plots
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.panel_corners import panel_corners
 from flexdt.twin.projection.volume import Volume
 from flexdt.twin.script import CheckReport, ScanPlan
 
 SAMPLES = 2000
 """Number of moments at which motors are drawn."""
 KINDS = {"dark": "k", "flat": "C1", "projection": "C0", "preview": "C7"}
-CORNERS = ((-0.5, -0.5), (-0.5, 0.5), (0.5, 0.5), (0.5, -0.5), (-0.5, -0.5))
 LAYERS = {"data": "attenuation", "sigma": "noise of attenuation", "bias_bound": "bound of its bias"}
 PANELS = 12
 """Largest number of panels drawn, evenly chosen."""
@@ -43,9 +43,8 @@ def plot_geometry(cone_vec: ConeVec, axes: Any = None) -> Any:
         centre = view.detector[0]
         axes.plot(*np.stack([view.source[0], centre]).T, "k-", linewidth=0.4)
         if view.detector_shape is not None:
-            rows, cols = view.detector_shape
-            edge = [centre + r * rows * view.v[0] + c * cols * view.u[0] for r, c in CORNERS]
-            axes.plot(*np.array(edge).T, "C1-", linewidth=0.8)
+            (corners,) = panel_corners(view)
+            axes.plot(*np.vstack([corners, corners[:1]]).T, "C1-", linewidth=0.8)
     axes.plot(*cone_vec.detector.T, "C1.", markersize=2, label="detector")
     axes.plot([0.0], [0.0], [0.0], "k+", label="origin of the object")
     axes.set(xlabel="x [mm]", ylabel="y [mm]", zlabel="z [mm]", title=f"{len(cone_vec)} views")

@@ -24,6 +24,7 @@ from flexdt.twin.geometry.conventions import (
     stage_rotation,
 )
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+from flexdt.twin.geometry.panel_corners import panel_corners
 from flexdt.twin.geometry.rigid import Rigid
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import Machine, Profile
@@ -98,9 +99,7 @@ class World:
     @property
     def corners(self) -> FloatArray:
         """Outer corners of the image: top left, top right, bottom right, bottom left (4, 3)."""
-        rows, cols = self.shape
-        a, b = self.u * cols / 2, self.v * rows / 2
-        return np.asarray(self.detector + [-a - b, a - b, a + b, b - a])
+        return np.asarray(panel_corners(self.view)[0])
 
 
 def camera_of(machine: Machine, camera: CameraState) -> CameraSettings:

@@ -18,9 +18,10 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.library.datasets.pictures import png_of
-from flexdt.library.notebook.notebook_slices import AXES, layer_of, window_of
+from flexdt.library.notebook.notebook_slices import AXES, grey_of, layer_of, window_of
 from flexdt.runtime.files.whole_files import write_whole
 from flexdt.twin.errors import TwinError
+from flexdt.twin.geometry.panel_corners import panel_corners
 
 if TYPE_CHECKING:
     from flexdt.library.datasets.image_set import ImageSet
@@ -37,8 +38,6 @@ MARGIN: Final = 0.06
 """Free margin around a geometry, as a share of the drawing's side."""
 ELEVATION_DEG: Final = 30.0
 """Of the eye above the plane of the turn, in the drawing of a geometry."""
-PANEL_CORNERS: Final = ((-0.5, -0.5), (-0.5, 0.5), (0.5, 0.5), (0.5, -0.5))
-"""Of a panel, in parts of its rows and columns from its centre."""
 NOT_DRAWN: Final = ' style="display:none"'
 HIDE_DRAWN: Final = "e.style.display = i == this.value ? '' : 'none'"
 """As `hidden`, which SVG does not know."""
@@ -193,8 +192,7 @@ class _Drawing:
         """
         ends = np.concatenate([cone_vec.source, cone_vec.detector, np.zeros((1, 3))])
         if cone_vec.detector_shape is not None:
-            panels = [panel_corners(cone_vec, i) for i in range(len(cone_vec))]
-            ends = np.concatenate([ends, *panels])
+            ends = np.concatenate([ends, *panel_corners(cone_vec)])
         low, high = ends.min(axis=0), ends.max(axis=0)
         half = np.linalg.norm(cone_vec.source, axis=1).min()
         wide = cone_vec.detector_shape or (1, 1)
@@ -241,7 +239,8 @@ class _Drawing:
         )
         corners = [centre]
         if cone_vec.detector_shape is not None:
-            corners = [self.point(corner) for corner in panel_corners(cone_vec, index)]
+            (panel,) = panel_corners(cone_vec[index : index + 1])
+            corners = [self.point(corner) for corner in panel]
         outline = " ".join(f"{x:.1f},{y:.1f}" for x, y in corners)
         return (
             f'<line x1="{source[0]:.1f}" y1="{source[1]:.1f}" x2="{centre[0]:.1f}" '
@@ -249,18 +248,6 @@ class _Drawing:
             f'<polygon points="{outline}" fill="#f80" fill-opacity=".3" stroke="#f80"/>'
             f'<circle cx="{source[0]:.1f}" cy="{source[1]:.1f}" r="4" fill="#d33"/>'
         )
-
-
-def panel_corners(cone_vec: ConeVec, index: int) -> npt.NDArray[np.float64]:
-    """Return the corners of a view's panel, (4, 3) [mm].
-
-    Args:
-        cone_vec: with the detector's shape.
-        index: of the view.
-    """
-    rows, cols = cone_vec.detector_shape or (0, 0)
-    centre, u, v = cone_vec.detector[index], cone_vec.u[index], cone_vec.v[index]
-    return np.array([centre + r * rows * v + c * cols * u for r, c in PANEL_CORNERS])
 
 
 def _some(count: int) -> list[int]:
@@ -279,8 +266,7 @@ def _small(image: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 def _grey(image: npt.NDArray[Any], low: float, high: float) -> npt.NDArray[np.uint8]:
     """Return a small picture with `low` black and `high` white; NaN is black."""
-    values = np.nan_to_num(_small(image).astype(np.float64), nan=low)
-    return np.asarray(np.clip(255.0 * (values - low) / (high - low), 0, 255), dtype=np.uint8)
+    return grey_of(_small(image).astype(np.float64), low, high)
 
 
 def _slider(count: int, what: str, handler: str, start: int) -> str:

@@ -29,6 +29,12 @@ def layer_of(data: npt.NDArray[Any], axis: int, index: int) -> npt.NDArray[Any]:
     return layer
 
 
+def grey_of(values: npt.NDArray[Any], low: float, high: float) -> npt.NDArray[np.uint8]:
+    """Return values in 8 bits, with `low` black and `high` white; NaN is black."""
+    grey = 255.0 * (np.nan_to_num(values, nan=low) - low) / (high - low)
+    return np.asarray(np.clip(grey, 0, 255), dtype=np.uint8)
+
+
 def window_of(values: npt.NDArray[Any], window: Sequence[float] | None) -> tuple[float, float]:
     """Return the values of black and white.
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from flexdt.library.datasets.pictures import png_of
-from flexdt.library.notebook.notebook_slices import AXES, layer_of, window_of
+from flexdt.library.notebook.notebook_slices import AXES, grey_of, layer_of, window_of
 
 if TYPE_CHECKING:
     from flexdt.twin.projection import Volume
@@ -48,8 +48,7 @@ def volume_widgets(widgets: Any, volume: Volume, window: Sequence[float] | None 
         places = {name: slider.value for name, slider in sliders.items()}
         for name, axis, across in AXES:
             layer = layer_of(volume.data, axis, places[name])
-            grey = 255.0 * (np.nan_to_num(layer, nan=black) - black) / (white - black)
-            pixels = np.repeat(np.clip(grey, 0, 255).astype(np.uint8)[:, :, None], 3, axis=2)
+            pixels = np.repeat(grey_of(layer, black, white)[:, :, None], 3, axis=2)
             right, up = across[0], across[1]
             pixels[:, places[right], 0] = 255
             pixels[len(pixels) - 1 - places[up], :, 0] = 255

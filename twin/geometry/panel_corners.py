@@ -1,0 +1,23 @@
+"""Outer corners of the panel in each view of a geometry."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import FloatArray
+
+
+def panel_corners(cone_vec: ConeVec) -> FloatArray:
+    """Compute the outer corners of the panel, (n, 4, 3) [mm].
+
+    Args:
+        cone_vec: views that know the detector's shape.
+
+    Returns:
+        In each view top left, top right, bottom right, bottom left, as the source sees them.
+    """
+    _, rows, cols = cone_vec.shape
+    across, down = cone_vec.u * cols / 2, cone_vec.v * rows / 2
+    offsets = np.stack([-across - down, across - down, across + down, down - across], axis=1)
+    return np.asarray(cone_vec.detector[:, None] + offsets)
